@@ -1,4 +1,4 @@
-"""A capture whose truth is known: points in front of cameras, and where each camera sees them."""
+"""A capture with a known truth: points in front of cameras, and their positions in each image."""
 
 import json
 import math
@@ -33,7 +33,7 @@ def poses(count: int = 9, radius: float = 3.0) -> np.ndarray:
 
 
 def seen_at(pose: np.ndarray, point: np.ndarray) -> tuple[float, float]:
-    """Column and row, (0, 0) being the image's corner, at which a pinhole camera sees a point of the input."""
+    """Column and row of a point of the input in a pinhole camera, with (0, 0) at the image's corner."""
     right, down, ahead = np.diag([1, -1, -1]) @ pose[:3, :3].T @ (point - pose[:3, 3])
     assert ahead > 0
     return CX + FX * right / ahead, CY + FY * down / ahead
@@ -53,7 +53,7 @@ def moved(given: np.ndarray, unit: float, shift: np.ndarray) -> np.ndarray:
 
 
 def write_capture(folder: Path, count: int = 9, given: np.ndarray | None = None, **changes: Any) -> Path:
-    """A nerfstudio folder, with other poses than those of `poses` if they are given; `changes` go into its file."""
+    """A nerfstudio folder, with `given` poses instead of `poses` if any; `changes` go into its file."""
     names = [f"{index:03d}.png" for index in range(count)]
     write_images(folder / "images", names)
     frames = [
@@ -83,7 +83,8 @@ def miss(cameras: Cameras, camera: int, column: float, row: float, point: torch.
 
 
 def worst_miss(scene: ParsedScene, true_poses: np.ndarray, points: np.ndarray = POINTS) -> float:
-    """Over all cameras and points, with images of any size: the rays at which the input's cameras see the points.
+    """Largest distance of a point from the ray of the pixel that shows it in the input, over all cameras and points,
+    with images of any size.
 
     Args:
         true_poses: (M, 4, 4) of the scene's images, in the input's frame.

@@ -1,4 +1,4 @@
-"""Captured scenes for the tests of their formats, and what their cameras must fulfil. Written without our own maths."""
+"""Captured scenes for the tests of their formats, and conditions for their cameras. Written without our own maths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -82,7 +82,7 @@ def write_colmap(
 ) -> Path:
     """A text model with ids that are neither contiguous nor in the order of the names, a camera an image.
 
-    Every point is seen by the first `tracks` images, or by those in `seen_by`.
+    Every point is seen by the first `tracks` images, or by the images in `seen_by`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     images = list(range(len(capture.names)))

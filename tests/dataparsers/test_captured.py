@@ -1,4 +1,4 @@
-"""What all formats of photographs share: files reduced beforehand, shapes, recognition of one format a folder."""
+"""Shared by all formats of photographs: files reduced beforehand, shapes, recognition of one format a folder."""
 
 import shutil
 from importlib import import_module
@@ -28,7 +28,7 @@ def capture(tmp_path: Path) -> Path:
 
 
 def test_intrinsics_follow_the_size_of_the_images_that_are_read(capture: Path) -> None:
-    """Those for 40x30 in a folder of images reduced by 2 that are 19x15: not by the folder's name."""
+    """Intrinsics for 40x30 in a folder of images reduced by 2 that are 19x15 do not follow the folder's name."""
     write_images(capture / "images_2", NAMES, 19, 15)
     scene = Nerfstudio(eval_mode="all", downscale_factor=2).parse(capture, "train")
     assert scene.downscale_factor == 1
@@ -76,7 +76,7 @@ def test_large_images_are_read_from_the_folder_of_reduced_ones(capture: Path) ->
 
 
 def test_reduced_images_may_be_all_there_is(capture: Path) -> None:
-    """And their endings may be others, as those of LLFF are."""
+    """Their endings may differ too, as in LLFF."""
     shutil.rmtree(capture / "images")
     write_images(capture / "images_4", [name.replace("png", "jpg") for name in NAMES], 10, 8)
     scene = Nerfstudio(eval_mode="all").parse(capture, "train")
@@ -128,7 +128,7 @@ def test_images_may_differ_in_size(capture: Path) -> None:
 
 
 def formats() -> dict[str, type[DataParser]]:
-    """Those of the project's own list, installed or not."""
+    """The formats of the project's own list, installed or not."""
     tomllib = pytest.importorskip("tomllib")
     content = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     found = {}

@@ -190,7 +190,7 @@ def test_tracks_give_pixels_their_distances(tmp_path: Path, capture: Capture, ca
 
 
 def test_few_images_start_at_the_points_that_they_see(tmp_path: Path, capture: Capture) -> None:
-    """As the blocks of a large scene do. Without tracks nobody knows who sees what, so all points stay."""
+    """Blocks of a large scene do so. Without tracks, the images of a point are unknown, so all points stay."""
     write_images(tmp_path / "images", capture.names)
     for folder, seen_by, tracks in (("a", (1, 3, 4), 3), ("b", None, 0)):
         write_colmap(tmp_path / folder, capture, seen_by=seen_by, tracks=tracks)
@@ -202,7 +202,7 @@ def test_few_images_start_at_the_points_that_they_see(tmp_path: Path, capture: C
 
 
 def test_what_held_out_images_know_is_not_learned_from(tmp_path: Path, capture: Capture) -> None:
-    """p00 and p08 are held out. With one training image left, a point's distance is known by them alone."""
+    """p00 and p08 are held out. If one training image is left, a point's distance is known by them alone."""
     write_images(tmp_path / "images", capture.names)
     for folder, seen_by, count in (("a", (0, 1, 8), None), ("b", (0, 1, 2), 30)):
         write_colmap(tmp_path / folder, capture, seen_by=seen_by)

@@ -1,4 +1,4 @@
-"""The COLMAP model beside a transforms.json gives its images' points, if it is what the file was made from."""
+"""The COLMAP model beside a transforms.json gives its images' points, if the file was made from it."""
 
 import json
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from tests.dataparsers.sparse_models import SIZE, Capture, make_capture, misses,
 
 ALL = Nerfstudio(eval_mode="all")
 APPLIED = np.array([[1.0, 0.0, 0.0, 0.3], [0.0, 0.0, 1.0, -0.2], [0.0, -1.0, 0.0, 0.1]])
-"""From the model's axes, with y down, to the file's, with z up; and a shift."""
+"""Transform from the model's axes, with y down, to the file's, with z up; and a shift."""
 SCALE = 1.7
 INTRINSICS = {"fl_x": 50.0, "fl_y": 48.0, "cx": 31.0, "cy": 19.0}
 
@@ -28,7 +28,7 @@ def capture() -> Capture:
 
 @pytest.fixture
 def folder(tmp_path: Path, capture: Capture) -> Path:
-    """As ns-process-data leaves it."""
+    """A data folder as ns-process-data leaves it."""
     write_images(tmp_path / "images", capture.names)
     write_colmap(tmp_path / "colmap" / "sparse" / "0", capture, seen_by=(1, 3, 4, 6))
     return write_transforms(tmp_path, capture)
@@ -58,7 +58,7 @@ def seen(scene: ParsedScene) -> list[str]:
 
 
 def test_pixels_have_the_distances_of_the_points_that_they_show(folder: Path, capture: Capture) -> None:
-    """As the capture itself says, and the colmap format finds."""
+    """The distances equal the capture's own, and the colmap format's."""
     scene = ALL.parse(folder, "train")
     assert scene.sightings is not None
     assert seen(scene) == ["p01.png", "p03.png", "p04.png", "p06.png"]
@@ -99,7 +99,7 @@ def test_frames_and_images_of_the_model_may_be_others(folder: Path) -> None:
 
 
 def test_images_may_have_had_other_names(folder: Path, capture: Capture) -> None:
-    """Those from which the images were made, as ns-process-data writes them down."""
+    """ns-process-data writes down the names of the original images."""
 
     def rename(content: dict[str, Any]) -> None:
         for number, (frame, name) in enumerate(zip(content["frames"], capture.names, strict=True)):

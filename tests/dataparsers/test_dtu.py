@@ -35,7 +35,7 @@ from tests.fuzz.payload import PROOF, Payload
 
 COUNT = 9
 MILLIMETRES, SHIFT = 200.0, np.array([-30.0, 15.0, 640.0])
-"""From the units of `captures` to those of the folder."""
+"""Transform from the units of `captures` to the folder's."""
 WORLD = MILLIMETRES * POINTS + SHIFT
 """The points in the folder's frame."""
 CENTER, RADIUS = MILLIMETRES * POINTS.mean(0) + SHIFT, 1.1 * MILLIMETRES
@@ -49,7 +49,7 @@ def true_poses(count: int = COUNT) -> np.ndarray:
 
 
 def projections(stretch: float = 1.0, count: int = COUNT, skew: float = 0.0) -> list[np.ndarray]:
-    """(4, 4) from the world to pixels of images `stretch` times as large, whose first has its centre at 0.5."""
+    """(4, 4) from the world to pixels of images `stretch` times as large; the first pixel has its centre at 0.5."""
     intrinsic = np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]])
     intrinsic[:2] *= stretch
     intrinsic[0, 1] = skew

@@ -1,4 +1,4 @@
-"""The nerfstudio format: rays go where the file's cameras look, and what makes no sense is refused in one line."""
+"""The nerfstudio format: rays go where the file's cameras look, and nonsense is refused in one line."""
 
 import dataclasses
 import json
@@ -34,7 +34,7 @@ from tests.dataparsers.captures import (
 from tests.exr_files import write_exr
 
 EXACT = 2e-6
-"""What float32 leaves of a ray's direction."""
+"""Precision of a ray's direction in float32."""
 ALL = Nerfstudio(eval_mode="all")
 
 
@@ -259,7 +259,7 @@ def test_instant_ngps_cube(capture: Path) -> None:
     ],
 )
 def test_splits(capture: Path, flags: Nerfstudio, train: list[int], held: list[int]) -> None:
-    edit(capture, lambda c: c["frames"].reverse())  # by sorted name, whatever the file's order
+    edit(capture, lambda c: c["frames"].reverse())  # by sorted name, in any order of the file
 
     def names(split: Split) -> list[int]:
         return [int(path.stem) for path in flags.parse(capture, split).image_paths]
@@ -311,7 +311,7 @@ def test_masks_depths_and_times(capture: Path) -> None:
 
 
 def test_names_of_windows(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With masks and lists written likewise."""
+    """Masks and lists are written likewise."""
     write_images(capture / "masks", ["004.png"])
 
     def change(content: dict[str, Any]) -> None:
@@ -512,7 +512,7 @@ def test_no_folder() -> None:
 @pytest.mark.data
 @pytest.mark.parametrize(("split", "count"), [("train", 43), ("val", 7)])
 def test_real_fox(real_data: Path, split: Split, count: int) -> None:
-    """instant-ngp's: 1080x1920, reduced to fit 1600; its cube is around what the cameras look at."""
+    """instant-ngp's: 1080x1920, reduced to fit 1600; its cube is around the point that the cameras look at."""
     scene = Nerfstudio().parse(real_data / "fox", split)
     data = load_dataset(scene[torch.arange(2)], split)
     assert len(scene.image_paths) == count

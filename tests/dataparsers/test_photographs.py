@@ -1,4 +1,4 @@
-"""Photographs of the courtyard: who stands in them, what they change, and what the light does."""
+"""Photographs of the courtyard: distractors in them, the pixels that these change, and the light."""
 
 import math
 from pathlib import Path

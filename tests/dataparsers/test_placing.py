@@ -28,7 +28,7 @@ def spreads(count: int, value: float) -> Tensor:
 
 
 def test_a_place_that_long_lenses_show_is_enlarged_until_an_image_shows_one_unit_of_it() -> None:
-    """At a distance of the root of 2, by hand."""
+    """The distance is the root of 2, by hand."""
     for spread in (0.01, 0.1, 0.3):
         assert enlargement(ring(12), spreads(12, spread)) == pytest.approx(1 / (math.sqrt(2) * spread))
     assert enlargement(ring(12), spreads(12, 0.36)) == 1  # which shows 0.509

@@ -170,7 +170,7 @@ def test_random_solids_fit_into_the_box_and_differ_between_scenes() -> None:
 
 
 def test_a_random_solid_has_its_own_colour_and_no_other() -> None:
-    """In the middle of an image, before the nearest solid on the axis: its albedo's hue, shaded."""
+    """The middle of an image shows the nearest solid on the axis: its albedo's hue, shaded."""
     parts = random_parts(0, 3)
     origins, directions = camera_rays(4000, seed=2)
     found = trace_rows(origins.T.contiguous(), directions.T.contiguous(), 0.0, parts=parts)
@@ -203,7 +203,7 @@ def test_no_scene_is_in_two_splits() -> None:
 
 @pytest.mark.medium
 def test_many_scenes_are_kept_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each image shows what tracing the solids of its scene along its own rays shows."""
+    """Each image equals tracing the solids of its scene along its own rays."""
     monkeypatch.setenv("NERFLOOM_CACHE", str(tmp_path))
     parser = Procedural(size=16, num_scenes=3, views_per_scene=4)
     train, test = (load_dataset(parser.parse(None, split), split) for split in ("train", "test"))

@@ -27,7 +27,7 @@ def quaternion(rotation: np.ndarray) -> list[float]:
 
 
 def write_record3d(folder: Path) -> Path:
-    """An export whose images are reduced by 2: the file's sizes are the recording's."""
+    """An export with images reduced by 2: the file's sizes are the recording's."""
     export = folder / "EXR_RGBD"
     write_images(export / "rgb", [f"{index}.jpg" for index in range(COUNT)], WIDTH // 2, HEIGHT // 2)
     content = {

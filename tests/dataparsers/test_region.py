@@ -1,6 +1,6 @@
-"""Renders of any unit, place and lens: the box holds what is there, and the file's intrinsics are used as they stand.
+"""Renders of any unit, place and lens: the box holds all matter, and the file's intrinsics are used unchanged.
 
-Matter is balls, whose silhouettes are known: a pixel is opaque if its ray passes a ball by less than its own half
+Matter is balls with known silhouettes: a pixel is opaque if its ray passes a ball by less than its own half
 diagonal, as anti-aliasing makes it.
 """
 
@@ -156,7 +156,7 @@ def test_the_box_holds_all_matter_and_little_else(name: str, tmp_path: Path) -> 
 
 
 def test_matter_that_no_image_shows_as_a_whole_is_in_a_larger_box(tmp_path: Path) -> None:
-    """Every image cuts some of it off at the left, above which it could be higher than anything that is shown."""
+    """Every image cuts off some of it at the left; there it could be higher than all that is shown."""
     shot = Shot(middle=(12.0, 35.0))
     assert all(shot.opaque(pose)[:, 0].any() for pose in shot.poses())
     scene = Blender().parse(shot.write(tmp_path), "train")
@@ -175,12 +175,12 @@ def test_without_alpha_the_box_is_where_the_cameras_look(unit: float, tmp_path: 
     shot = Shot(unit=unit, center=(3 * unit, 0.0, unit))
     scene = Blender().parse(shot.write(tmp_path, alpha=False), "train")
     assert 1 <= room_around(scene, shot) < 2.7
-    assert scene.unbounded  # what is behind is in the images, too
+    assert scene.unbounded  # the images show matter behind, too
 
 
 @pytest.mark.medium
 def test_a_moving_scene_is_where_the_cameras_look_and_ends_there(tmp_path: Path) -> None:
-    """At each time something may be elsewhere, so that silhouettes of different times say nothing together."""
+    """Matter may move between times, so silhouettes of different times say nothing together."""
     shot = Shot(unit=3.0, center=(1.0, 2.0, 3.0))
     scene = DNeRF().parse(shot.write(tmp_path, times=True), "train")
     assert 1 <= room_around(scene, shot) < 2.7
@@ -244,7 +244,7 @@ def test_contradictions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_without_focal_lengths_pixels_are_square(tmp_path: Path) -> None:
-    """Blender's angle_y is that of its sensor: by it, a pixel would be as wide as two are high."""
+    """Blender's angle_y belongs to its sensor: with it, a pixel would be twice as wide as high."""
     folder = Shot(count=3).write(tmp_path, fl_x=None, fl_y=None)
     cameras = Blender().parse(folder, "train").cameras
     torch.testing.assert_close(cameras.fx, torch.full((3,), 100.0))
@@ -286,7 +286,7 @@ def test_nerf_synthetic_stays_as_it_is(distance: float, scales: int, tmp_path: P
 
 @pytest.mark.medium
 def test_a_trained_scene_is_placed_as_it_was(tmp_path: Path) -> None:
-    """With the placement of then, whatever the images of now show."""
+    """The old placement stays, with any new images."""
     shot = Shot(unit=2.0, center=(1.0, 0.0, 0.0))
     folder = shot.write(tmp_path / "data")
     then = Blender().parse(folder, "test")

@@ -37,7 +37,7 @@ SCALE = 200.0
 TO_GT = np.eye(4)
 TO_GT[:3, :3] = SCALE * Rotation.from_rotvec([0.4, -0.7, 0.3]).as_matrix()
 TO_GT[:3, 3] = (-30.0, 15.0, 640.0)
-"""From the file's frame to the original one, in millimetres."""
+"""Transform from the file's frame to the original one, in millimetres."""
 LOW, HIGH = POINTS.min(0) - np.array([0.5, 0.7, 0.9]), POINTS.max(0) + np.array([0.9, 0.7, 0.5])
 
 
@@ -98,7 +98,7 @@ def test_rays_meet_the_points_in_the_original_frame(folder: Path, orientation: A
 
 
 def test_the_box_is_the_files(folder: Path) -> None:
-    """As it is where the scene is not turned; around it where it is. Its longest edge is 2."""
+    """The box is the file's if the scene is not turned, and contains it otherwise. Its longest edge is 2."""
     scene = SdfStudio().parse(folder, "train")
     corners = to_scene(scene, in_gt(np.stack([LOW, HIGH])))
     torch.testing.assert_close(scene.box.double(), corners, rtol=1e-6, atol=1e-6)

@@ -37,7 +37,7 @@ def test_blurred_light_is_the_mean_of_sharp_light(roughness: float) -> None:
 
 
 def test_a_mirror_shows_the_environment() -> None:
-    """Along the ray through the middle of the ball, what is behind the camera; at its edge, what is behind the ball."""
+    """The middle of the ball shows the environment behind the camera, and its edge the environment behind the ball."""
     (ball,) = SCENES["mirror"]
     origin = torch.tensor([[4.0, 0.0, 0.0]], dtype=torch.float64).T
     edge = math.asin(ball.shape.bound / 4) - 1e-9

@@ -98,7 +98,7 @@ def test_light_passes_through_a_hole() -> None:
     start = torch.tensor([-2.0], dtype=torch.float64)
     assert BORED.enter(through, down, start).tolist() == [math.inf]
     into = normalize(torch.tensor([[1.0, 0, -1]], dtype=torch.float64), dim=-1).T
-    # From the middle of the hole outwards: the wall is at x = 0.15.
+    # Outwards from the middle of the hole, the wall is at x = 0.15.
     middle = torch.zeros(3, 1, dtype=torch.float64)
     assert float(BORED.enter(middle, into, torch.tensor([0.0]).double())) == pytest.approx(0.15 * 2**0.5)
 

@@ -1,4 +1,4 @@
-"""Gaussians whose places are known."""
+"""Gaussians at known places."""
 
 import math
 from pathlib import Path

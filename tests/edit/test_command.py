@@ -150,7 +150,7 @@ def test_floaters_are_looked_for_before_a_crop_takes_the_surfaces_behind() -> No
 
 @pytest.mark.medium
 def test_a_run_is_edited_and_what_it_costs_is_said(shared_tiny: Path, tmp_path: Path) -> None:
-    """PSNR on held-out photographs is that of ns-eval, before and after."""
+    """PSNR on held-out photographs equals ns-eval's, before and after."""
     run, output = trained(shared_tiny, tmp_path / "out"), tmp_path / "half.ply"
     said = edited(run, "--output-path", output, "--reduce-to", 100, "--max-images", 3)
     assert len(read_gaussians(output).gaussians) == 100

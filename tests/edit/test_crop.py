@@ -1,4 +1,4 @@
-"""Crops: what is inside and outside is known."""
+"""Crops of clouds with a known inside and outside."""
 
 from pathlib import Path
 
@@ -158,7 +158,7 @@ def test_regions_apart_have_no_bounds() -> None:
 
 
 def test_inside_of_a_polygon() -> None:
-    """An L, whose inside is the union of two rectangles, by brute force on a lattice of no corner's coordinates."""
+    """The inside of an L is the union of two rectangles, by brute force on a lattice of no corner's coordinates."""
     corners = ((0.0, 0.0), (4.0, 0.0), (4.0, 1.0), (1.0, 1.0), (1.0, 3.0), (0.0, 3.0))
     rows, columns = torch.meshgrid(torch.arange(-1.05, 5, 0.2), torch.arange(-1.05, 5, 0.2), indexing="ij")
     x, y = columns.flatten().double(), rows.flatten().double()

@@ -65,7 +65,7 @@ def test_a_far_background_is_not_isolated() -> None:
 
 
 def alpha(opacity: float, size: float, distance: float) -> np.ndarray:
-    """Alpha (33, 33) of a round Gaussian on the axis of `camera()`, whose focal length is 40."""
+    """Alpha (33, 33) of a round Gaussian on the axis of `camera()`, which has a focal length of 40."""
     rows, columns = np.mgrid[:33, :33] + 0.5
     squared = (rows - 16.5) ** 2 + (columns - 16.5) ** 2
     found = opacity * np.exp(-squared / (2 * ((40 * size / distance) ** 2 + BLUR)))

@@ -25,7 +25,7 @@ SHIFT = torch.tensor([5e5, 5.4e6, 300.0], dtype=torch.float64)
 
 
 def precise(count: int = 30, terms: int = 15) -> Edited:
-    """Gaussians of which every number is float64."""
+    """Gaussians with float64 numbers."""
     given = scattered(count, terms=terms).gaussians.map(torch.Tensor.double)
     sizes = given.log_scales + torch.randn(count, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     return Edited(dataclasses.replace(given, log_scales=sizes))
@@ -74,7 +74,7 @@ def test_a_scale_names_the_unit_or_forgets_it() -> None:
 
 
 def test_what_has_been_moved_stays_where_it_was_in_the_scene() -> None:
-    """In the coordinates of a survey, to a micrometre, and harmonics as well."""
+    """The error is below a micrometre in the coordinates of a survey, and harmonics agree as well."""
     turn = torch.from_numpy(Rotation.random(random_state=3).as_matrix())
     placement = Placement(torch.cat([turn, -(turn @ SHIFT)[:, None]], -1), 0.25)
     given = scattered(50, terms=8)
@@ -112,7 +112,7 @@ def test_no_direction_is_refused() -> None:
 
 
 def test_three_points_come_to_their_targets() -> None:
-    """By a similarity that is known, exactly; without its scale, the shape keeps its size."""
+    """The similarity is known, and found exactly; without its scale, the shape keeps its size."""
     edited, turn = scattered(20), Rotation.random(random_state=1)
     corners = np.array([[0.0, 0, 0], [2.0, 0.1, 0], [0.3, 1.0, 0.5]])
 
@@ -156,7 +156,7 @@ def room(tilt: float) -> tuple[Edited, Tensor]:
 
 @pytest.mark.parametrize("tilt", [0.0, 12.0, -30.0])
 def test_a_tilted_floor_becomes_the_plane_z_is_0(tilt: float) -> None:
-    """To a millionth, with all heights above it, and its middle where it was from above."""
+    """The error is below a millionth; all heights are above it, and its middle stays where it was from above."""
     edited, heights = room(tilt)
     placed = edit.align_floor(edited)
     found = placed.gaussians.means
@@ -178,7 +178,7 @@ def test_a_floor_of_another_up_direction() -> None:
 
 @pytest.mark.parametrize("degrees", [-90.0, 100.0, 180.0])
 def test_a_floor_is_found_where_the_scene_is_up(degrees: float) -> None:
-    """In the axes of a scene whose up direction is another one, or after set_up."""
+    """The scene has another up direction in its axes, or set_up has changed it."""
     edited, heights = room(0.0)
     turned = edit.rotate(edited, (1.0, 0.0, 0.0), degrees)
     assert float((edit.align_floor(turned).gaussians.means[:, 2] - heights).abs().max()) < 1e-6
@@ -197,7 +197,7 @@ def test_no_floor_is_said() -> None:
 
 
 COLMAP = torch.tensor([[1.0, 0, 0, 2.0], [0, 0, 1.0, -1.0], [0, -1.0, 0, 5.0]], dtype=torch.float64)
-"""From axes x right, y down, z ahead to a scene whose up is +z, with a shift."""
+"""Transform from axes x right, y down, z ahead to a scene with +z up, with a shift."""
 
 
 @pytest.mark.parametrize("known", ["set_up", "scene"])

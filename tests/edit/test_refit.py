@@ -25,7 +25,7 @@ def error(found: Edited, whole: Edited) -> float:
 
 @pytest.mark.medium
 def test_what_is_left_looks_more_like_all_of_them(tmp_path: Path) -> None:
-    """In a frame that steps have moved, too. Nothing else of the Gaussians changes its place by much."""
+    """This holds in a frame that steps have moved, too. The Gaussians hardly change their places."""
     whole = edit.scale(edit.move(ball_in_capture(tmp_path), (3.0, 0.0, -2.0)), 0.2)
     fewer, refitted = edit.reduce_to(whole, 150), edit.reduce_to(whole, 150, refit_steps=500)
     assert len(refitted) == len(fewer) == 150

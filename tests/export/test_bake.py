@@ -40,7 +40,7 @@ BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])
 
 
 class Ball:
-    """A model whose density is known."""
+    """A model with a known density."""
 
     scene = Scene(box=BOX, near=0.1, far=9.0, num_cameras=1, has_alpha=True, moving=False, image_size=40)
     device = torch.device("cpu")

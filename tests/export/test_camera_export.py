@@ -27,7 +27,7 @@ SPLITS = ("train", "val", "test")
 
 
 def exported(parser: DataParser, data: Path) -> tuple[PosedFiles, dict[str, ParsedScene]]:
-    """What a run on some data exports, as far as it depends on the data."""
+    """The part of a run's export that depends on the data."""
     scenes = {split: parser.parse(data, split) for split in SPLITS}
     return posed_files(scenes, scenes["train"].placement), scenes
 

@@ -1,4 +1,4 @@
-"""The density of a model as a surface: levels, cells that are skipped, and what there is to say without a surface."""
+"""The density of a model as a surface: levels, skipped cells, and the error without a surface."""
 
 import math
 from contextlib import nullcontext
@@ -42,7 +42,7 @@ class Matter(nn.Module):
 
 
 def soft(positions: Tensor) -> Tensor:
-    """A ball whose density falls by e in each 0.1 outwards, and is 10 at radius 0.5."""
+    """A ball with a density that falls by e in each 0.1 outwards, and is 10 at radius 0.5."""
     return 10 * ((0.5 - positions.norm(dim=-1)) / 0.1).exp()
 
 
@@ -71,7 +71,7 @@ def grid_of(kept: Any) -> OccupancySampler:
 
 
 def test_cells_that_the_renderer_skips_are_empty_and_not_evaluated() -> None:
-    """The density there was never learnt: here it is that of a wall."""
+    """The density there was never learnt: here it is a wall's."""
 
     def walled(positions: Tensor) -> Tensor:
         return torch.where(positions[:, 0] > 0.75, 1e4, soft(positions))

@@ -49,7 +49,7 @@ def test_a_ball_has_its_volume_and_no_seam_whatever_the_blocks(edge: int) -> Non
 
 
 def test_blocks_of_noise_meet_without_a_gap() -> None:
-    """Of every case of marching cubes; values of lattice points are the same in all blocks that share them."""
+    """Noise has every case of marching cubes; values of lattice points are the same in all blocks that share them."""
     torch.manual_seed(0)
     noise = torch.rand(25, 25, 25) - 0.5
     noise[[0, -1]] = noise[:, [0, -1]] = noise[:, :, [0, -1]] = -0.3
@@ -109,7 +109,7 @@ def test_noise_ends_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("seed", [32, 75])
 def test_beside_unknown_points_only_their_cells_are_left_out(seed: int) -> None:
-    """Of these seeds' noise some triangles lie in the block's last face, where no cell begins."""
+    """These seeds' noise has triangles in the block's last face, where no cell begins."""
     noise = torch.from_numpy(np.random.default_rng(seed).uniform(-0.5, 0.5, (9, 9, 9)).astype(np.float32))
     lattice = lattice_of(torch.tensor([[0.0, 0, 0], [8, 8, 8]]), 8)
 

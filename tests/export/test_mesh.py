@@ -60,7 +60,7 @@ def test_hollows_are_dropped_unless_a_camera_is_inside() -> None:
 
 
 def test_a_surface_that_is_open_is_no_hollow_whatever_its_volume() -> None:
-    """As a wall that leaves the box, whose signed volume depends on where the origin is."""
+    """The signed volume of a wall that leaves the box depends on the origin."""
     open_ = sphere(1.0, inward=True)
     open_ = open_.with_faces(open_.vertices[open_.faces].mean(1)[:, 2] < 0.5)
     kept, dropped = largest_components(together(sphere(0.5, (5, 0, 0)), open_), 0, 0.0, NOWHERE)
@@ -128,7 +128,7 @@ def test_files_are_read_back(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("kind", "center"), [("ply", (2, 0, 0)), ("obj", (2, 0, 0)), ("glb", (0, 2, 0))])
 def test_ns_export_turns_up_to_y_in_glb_files(kind: str, center: tuple[int, int, int], tmp_path: Path) -> None:
-    """A ball above the middle of the scene, whose input has x up and twice the size."""
+    """A ball is above the middle of the scene; the input has x up and twice the size."""
     up_is_x = torch.tensor([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
     mesh = sphere(0.5, (0, 0, 1))
     mesh = Mesh(mesh.vertices, mesh.faces, vertex_normals(mesh))

@@ -54,7 +54,7 @@ class Drawn(Ball):
 
 
 class Data(SimpleNamespace):
-    """As much of a data set as points ask for."""
+    """The part of a data set that points need."""
 
     def __len__(self) -> int:
         return len(self.cameras)

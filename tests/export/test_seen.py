@@ -32,7 +32,7 @@ def above(count: int = 6) -> Cameras:
 
 
 def plate(height: float, cells: int = 40, half: float = 1.0, up: bool = True) -> Mesh:
-    """A square of triangles at a height, whose faces look up or down."""
+    """A square of triangles at a height, with faces that look up or down."""
     side = torch.linspace(-half, half, cells + 1, dtype=torch.float64)
     x, y = torch.meshgrid(side, side, indexing="ij")
     vertices = torch.stack([x, y, torch.full_like(x, height)], -1).view(-1, 3)

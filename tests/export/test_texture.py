@@ -1,4 +1,4 @@
-"""Textures: what interpolation within a triangle reads, and files read back by trimesh."""
+"""Textures: interpolation within a triangle, and files read back by trimesh."""
 
 from collections.abc import Callable
 from dataclasses import replace

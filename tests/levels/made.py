@@ -36,7 +36,7 @@ def cloud(count: int = 3000, degree: int = 1, random: torch.Generator | None = N
 def built(
     file: Path, gaussians: Gaussians, chunk_size: int = CHUNK, bits: Bits = 32, memory: float = 0.5, look: Look = OURS
 ) -> LevelsFile:
-    """With so little memory that there are several buckets."""
+    """The memory is so small that there are several buckets."""
     stream = GaussianStream.of(Splats(gaussians, look))
     build_levels(file, stream, torch.zeros(3, dtype=torch.float64), chunk_size, bits, memory)
     return read_levels(file)
@@ -63,7 +63,7 @@ def camera(distance: float = 3.0, model: str = "pinhole", turn: float = 0.0, siz
 
 
 def all_around(model: str, distance: float) -> Cameras:
-    """A camera, placed as `camera` does, that sees what is beside and behind it: a panorama, or an ideal fisheye."""
+    """A camera, placed as `camera` does, that sees in all directions: a panorama, or an ideal fisheye."""
     if model == "fisheye":  # 2.3 radians from the axis at the middle of an edge
         length = torch.tensor([14.0])
         return replace(camera(distance, "fisheye", turn=0.5), fx=length, fy=length, lens=None)

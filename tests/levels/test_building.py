@@ -140,7 +140,7 @@ def test_a_tree_of_planes_has_equal_cells() -> None:
 
 @pytest.mark.medium
 def test_200_000_gaussians_are_built_within_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """numpy tells tracemalloc of its arrays; the tensors are the parts of the stream and those that are merged."""
+    """numpy tells tracemalloc of its arrays; the tensors are the parts of the stream and the merged Gaussians."""
     count, chunk, memory, lengths = 200_000, 2000, 8.0, list[int]()
 
     def parts(most: int) -> Iterator[Gaussians]:

@@ -1,4 +1,4 @@
-"""ns-export levels, and the commands that open what it writes."""
+"""ns-export levels, and the commands that open its files."""
 
 import json
 from pathlib import Path
@@ -111,7 +111,7 @@ def test_offsets_scales_regions_and_frames_are_kept(tmp_path: Path) -> None:
 
 
 def test_blocks_are_written_one_after_the_other(tmp_path: Path) -> None:
-    """What two blocks have of one cloud, each in its own frame, in the frame of the input."""
+    """Two blocks have parts of one cloud, each in its own frame; the result is in the frame of the input."""
     whole, own = placement(0.5, (1.0, 2.0, 0.0)), (placement(2.0, angle=0.4), placement(3.0, (0.0, -4.0, 1.0)))
     models = [DrawnGaussians(transformed(cloud(500), *each.similarity()), OURS, scene()) for each in own]
     blocks = [block((-0.5, 0.0, 0.0), 4.0), block((0.5, 0.0, 0.0), 4.0)]

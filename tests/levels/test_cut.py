@@ -1,4 +1,4 @@
-"""Cuts of a tree: compared with a walk from the root, with budgets, and with what the rasteriser draws."""
+"""Cuts of a tree: compared with a walk from the root, with budgets, and with the rasteriser's pictures."""
 
 import pytest
 import torch
@@ -88,7 +88,7 @@ def test_nothing_that_is_drawn_is_left_out(file: LevelsFile, number: int) -> Non
     ]
     assert not (torch.tensor(visible) & ~seen).any()
     above = file.nodes.of_parents(seen.long(), 1).bool()
-    assert bool((above | ~seen).all())  # what is seen is below what is seen
+    assert bool((above | ~seen).all())  # nodes above a visible node are visible
     print(f"{int(seen.sum())} of {len(seen)} nodes may be seen, {sum(visible)} are")
 
 

@@ -1,4 +1,4 @@
-"""Pictures of levels: those of all Gaussians at error 0, near them with less, within a limit of memory."""
+"""Pictures of levels: equal to pictures of all Gaussians at error 0, similar with fewer, within a limit of memory."""
 
 import math
 from pathlib import Path
@@ -57,7 +57,7 @@ def test_error_0_is_the_picture_of_all_gaussians(tmp_path: Path, look: Look, mod
 @pytest.mark.parametrize("look", [OURS, Look(sort="depth")])
 @pytest.mark.parametrize("model", ["fisheye", "equirectangular"])
 def test_what_is_behind_is_in_a_picture_of_all_directions(tmp_path: Path, look: Look, model: str) -> None:
-    """Sorted by distance, whatever the Gaussians were trained with, from a place among them and one beside them."""
+    """Gaussians are sorted by distance, for all settings of training, from a place among them and one beside them."""
     levels = drawn(built(tmp_path / "x.levels", cloud(), look=look), 0.0)
     plain = DrawnGaussians(cloud(), look, scene())
     for distance in (0.3, 3.0):

@@ -1,4 +1,4 @@
-"""Files of levels: the layout as documented, what 16 bits lose, and hostile files refused in one line."""
+"""Files of levels: the layout as documented, the loss of 16 bits, and hostile files refused in one line."""
 
 import hashlib
 import json

@@ -124,7 +124,7 @@ def metashape_pixels(local: np.ndarray, c: dict[str, float], fisheye: bool) -> n
 
 
 def to_world(index: int, local: np.ndarray, similarity: tuple[np.ndarray, np.ndarray, float] = CHUNK) -> np.ndarray:
-    """(K, 3) in the world of Metashape: through the camera's transform, then that of the chunk."""
+    """(K, 3) in the world of Metashape: through the camera's transform, then the chunk's."""
     rotation, translation, scale = similarity
     return (local @ rotation_at(index).T + position_at(index)) * scale @ rotation.T + translation
 
@@ -265,7 +265,7 @@ def bundler_pixels(local: np.ndarray) -> np.ndarray:
 
 
 def in_world(index: int, local: np.ndarray) -> np.ndarray:
-    """(K, 3) in the world of cameras whose poses are `rotation_at` and `position_at`."""
+    """(K, 3) in the world of cameras with the poses `rotation_at` and `position_at`."""
     return local @ rotation_at(index).T + position_at(index)
 
 
@@ -273,7 +273,7 @@ def in_world(index: int, local: np.ndarray) -> np.ndarray:
 
 
 def written_pixels(content: dict[str, Any], frame: dict[str, Any], world: np.ndarray) -> np.ndarray:
-    """(K, 2) by what transforms.json says, of points in the program's frame (nerfstudio's data conventions)."""
+    """(K, 2) pixels of points in the program's frame, by transforms.json (nerfstudio's data conventions)."""
     value = {**content, **frame}
     applied = np.array(content["applied_transform"])
     pose = np.array(frame["transform_matrix"])

@@ -1,4 +1,4 @@
-"""Photographs of a corner of three textured planes, with exact poses: what poses found are held against."""
+"""Photographs of a corner of three textured planes, with exact poses, to compare found poses with."""
 
 import math
 from pathlib import Path
@@ -33,7 +33,7 @@ def pose_at(angle: float, height: float) -> np.ndarray:
 
 
 def photograph(pose: np.ndarray, textures: list[np.ndarray], finer: int = 2) -> Image.Image:
-    """What a camera sees of the planes x = 0, y = 0, z = 0: the first of them that a ray meets."""
+    """A camera's image of the planes x = 0, y = 0, z = 0: the first of them that a ray meets."""
     rows, columns = (np.mgrid[: HEIGHT * finer, : WIDTH * finer] + 0.5) / finer
     local = np.stack([(columns - WIDTH / 2) / FOCAL, -(rows - HEIGHT / 2) / FOCAL, -np.ones_like(rows)], -1)
     directions, origin = local @ pose[:3, :3].T, pose[:3, 3]

@@ -23,7 +23,7 @@ PARAMS = [
     1220.0, 1461.1, 1447.1, 0.411, -0.4565, 0.0383, 1.2983, -1.7705, 0.655,
     -8e-3, 4e-3, -5.9e-3, 5.6e-3, 5.2e-3, 2.4e-3,
 ]  # fmt: skip
-"""A lens like that of the glasses, with larger tangential and thin-prism terms."""
+"""A lens like the glasses', with larger tangential and thin-prism terms."""
 SIDE, COUNT, START = 240, 6, 149_202_610
 GRAPH = "ea7288b8-b6a0-012d-8156-257aba6bd796"
 CAMERA = ([0.9416, [0.3325, 0.034, 0.0417]], [-0.004, -0.0119, -0.0044])

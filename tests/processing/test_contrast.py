@@ -18,7 +18,7 @@ def ramp(low: float, high: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("top", "kind"), [(255, np.uint8), (65535, np.uint16)])
 def test_the_range_is_found_and_stretched(top: int, kind: type) -> None:
-    """Of a ramp from 20 % to 30 %, the 1st and 99th percentiles are 20.1 % and 29.9 %."""
+    """The 1st and 99th percentiles of a ramp from 20 % to 30 % are 20.1 % and 29.9 %."""
     image = Image.fromarray((ramp(0.2, 0.3) * top).round().astype(kind))
     assert tones(image) == pytest.approx((0.201, 0.299), abs=1 / 255)
     expected = (ramp(0.2, 0.3) - 0.201) / 0.098 * 255

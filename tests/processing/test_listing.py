@@ -1,4 +1,4 @@
-"""The files of a folder, and what is said about those left out."""
+"""The files of a folder, and reports on left-out files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Masks of what moves, in files that data formats read."""
+"""Masks of moving things, in files that data formats read."""
 
 import dataclasses
 import json

@@ -1,6 +1,6 @@
-"""Phones' captures with something wrong in them: refused in one line that names the file, and nothing is written.
+"""Phones' captures with faults: refused in one line that names the file, and nothing is written.
 
-What is only unusual is converted, and said.
+Unusual captures are converted, with a report.
 """
 
 import json
@@ -104,7 +104,7 @@ def test_reduced_images_of_record3d(tmp_path: Path) -> None:
 
 
 def test_points_of_record3d_move_with_the_poses(tmp_path: Path) -> None:
-    """Those of all files of a folder; a point that a camera sees is where its ray leads."""
+    """Points of all files of a folder: a point that a camera sees is on its ray."""
     folder = write_record3d(tmp_path / "recording")
     (tmp_path / "points").mkdir()
     for number, point in enumerate(POINTS):

@@ -55,14 +55,14 @@ PLACE = np.array([-2499366.4, -4256836.5, 4029217.9])
 
 
 def process(kind: str, data: Path, output: Path, *flags: object) -> tuple[dict[str, Any], str]:
-    """Run ns-process-data; returns transforms.json and what was said."""
+    """Run ns-process-data; returns transforms.json and the output."""
     done = called("ns-process-data", kind, "--data", data, "--output-dir", output, "--num-downscales", 0, *flags)
     assert done.returncode == 0, done.stderr
     return json.loads((output / "transforms.json").read_text()), " ".join(done.stderr.split())
 
 
 def frames_of(content: dict[str, Any]) -> list[dict[str, Any]]:
-    """Frames in the order of `NAMES`, some of which may be missing."""
+    """Frames in the order of `NAMES`; some may be missing."""
     return sorted(content["frames"], key=lambda frame: str(frame["source_path"]))
 
 
@@ -130,7 +130,7 @@ def test_panoramas_of_metashape_may_stay_whole(tmp_path: Path) -> None:
 
 
 def test_a_component_leads_to_the_globe_and_up_is_away_from_it(tmp_path: Path) -> None:
-    """As Metashape 2 writes it: the transform is that of the component, and the coordinates are geocentric."""
+    """Metashape 2 writes the component's transform, and geocentric coordinates."""
     similarity = (ROTATION, PLACE, 12.35)
     component = f'<components><component id="0" label="Component 1">{transform(similarity)}</component></components>'
     reference = '<reference>GEOGCS["WGS 84",DATUM["World Geodetic System 1984"]]</reference>'
@@ -339,7 +339,7 @@ def test_colours_of_any_type(kind: str, factor: float, tmp_path: Path) -> None:
 def test_points_that_single_precision_has_rounded(
     kind: str, rounded: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Geocentric coordinates have six digits before the point, of which float32 keeps half metres."""
+    """Geocentric coordinates have seven digits before the point, so float32 keeps half metres."""
     component = f'<components><component id="0">{transform((ROTATION, PLACE, 1.0))}</component></components>'
     xml = write_cameras(tmp_path, sensor(0, "frame", FRAME), all_cameras('component_id="0"'), component)
     points = np.concatenate([to_world(index, in_view(index), (ROTATION, PLACE, 1.0)) for index in range(COUNT)])
@@ -459,7 +459,7 @@ def test_opensfm(kind: str, tmp_path: Path) -> None:
 
 
 def test_an_image_that_was_turned_since_is_left_out(tmp_path: Path) -> None:
-    """The camera is for images of another shape, whose lens would fit none of its pixels."""
+    """The camera is for images of another shape, so its lens would fit none of the pixels."""
     write_odm(tmp_path / "project")
     Image.new("RGB", (HEIGHT, WIDTH)).save(tmp_path / "project" / "images" / NAMES[1])
     content, said = process("odm", tmp_path / "project", tmp_path / "out")
@@ -593,7 +593,7 @@ def test_a_list_that_is_too_short(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("longitude", "latitude"), [(0.3, 0.7), (-2.1, -0.4), (1.5, 0.0)])
 def test_up_is_the_normal_of_the_ellipsoid(longitude: float, latitude: float) -> None:
-    """At a geodetic latitude, whose position is N cos, N cos, N (b / a)^2 sin with N the radius of curvature."""
+    """The position at a geodetic latitude is N cos, N cos, N (b / a)^2 sin with N the radius of curvature."""
     flat = (POLE / EQUATOR) ** 2
     radius = EQUATOR / math.sqrt(math.cos(latitude) ** 2 + flat * math.sin(latitude) ** 2)
     normal = np.array([
@@ -612,7 +612,7 @@ def test_at_a_pole_there_is_a_frame_too() -> None:
 
 
 def test_poses_of_the_parser_are_those_of_the_program(tmp_path: Path) -> None:
-    """From the file through the data format to rays: points lie on the rays of their pixels."""
+    """Points lie on the rays of their pixels, from the file through the data format to rays."""
     write_metashape(tmp_path)
     process("metashape", tmp_path / "photographs", tmp_path / "out", "--xml", tmp_path / "cameras.xml")
     scene = Nerfstudio(eval_interval=0).parse(tmp_path / "out", "train")

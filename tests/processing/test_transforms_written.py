@@ -21,7 +21,7 @@ def world_to_camera(index: int) -> np.ndarray:
 
 
 def test_points_are_seen_where_colmap_sees_them(tmp_path: Path) -> None:
-    """Through COLMAP's own equations, and through what was written and read back."""
+    """COLMAP's own equations and the files written and read back agree."""
     (tmp_path / "images").mkdir()
     lens = transforms.lens_of("PINHOLE", 64, 48, [50.0, 52.0, 31.0, 25.0])
     frames = []

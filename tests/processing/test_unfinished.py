@@ -1,4 +1,4 @@
-"""Runs that were stopped, and what is matched."""
+"""Runs that were stopped, and pairs of images to match."""
 
 import os
 from dataclasses import replace
@@ -67,7 +67,7 @@ def test_ordered_images_are_matched_in_order() -> None:
 
 
 def test_loops_are_looked_for_away_from_neighbours() -> None:
-    """On a circle of 40 views walked twice, views 20 apart are alike, and neighbours even more so."""
+    """A circle of 40 views is walked twice: views 20 apart are alike, and neighbours even more so."""
     angles = np.arange(40) * 2 * np.pi / 20
     descriptors = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     assert {abs(j - i) for i, j in similar_pairs(descriptors, 2)} <= {0, 1, 19, 20, 21, 39}

@@ -13,7 +13,7 @@ from nerfloom.processing.frame_choice import blocks, different, intervals, sharp
 from nerfloom.processing.video import line, write_frames
 
 BITS = 6
-"""Squares of a frame whose brightness is its number in binary."""
+"""Squares of a frame; their brightness is its number in binary."""
 
 
 def frame(blur: int, seed: int = 0) -> np.ndarray:
@@ -46,7 +46,7 @@ def test_there_are_as_many_intervals_as_asked_for_whatever_the_times(seed: int) 
 
 
 def test_intervals_are_equal_in_time_and_not_in_frames() -> None:
-    """Of 90 frames in a second and 10 in the next, half of the intervals are in each second."""
+    """With 90 frames in a second and 10 in the next, half of the intervals are in each second."""
     times = np.concatenate([np.arange(90) / 90, 1 + np.arange(10) / 10])
     found = intervals(times, 10)
     assert np.array_equal(found[:90], np.arange(90) // 18)

@@ -1,4 +1,4 @@
-"""Views of wide images: where they look by hand, and their colours against those of the directions that they show."""
+"""Views of wide images: their directions by hand, and their colours against the colours of these directions."""
 
 import json
 import math
@@ -37,7 +37,7 @@ def color_of(directions: np.ndarray) -> np.ndarray:
 
 
 def panorama(turn: np.ndarray) -> np.ndarray:
-    """(WIDE / 2, WIDE, 3) uint8: the pattern as a panorama shows it, whose camera is turned so."""
+    """(WIDE / 2, WIDE, 3) uint8: the pattern in a panorama of a camera turned by `turn`."""
     rows, columns = np.mgrid[: WIDE // 2, :WIDE] + 0.5
     longitude, latitude = (columns / WIDE - 0.5) * 2 * np.pi, (rows / (WIDE // 2) - 0.5) * np.pi
     local = [np.cos(latitude) * np.sin(longitude), np.sin(latitude), np.cos(latitude) * np.cos(longitude)]
@@ -180,7 +180,7 @@ def test_flags_that_contradict_each_other(tmp_path: Path) -> None:
 
 
 def test_panoramas_beside_photographs_become_views(tmp_path: Path) -> None:
-    """A capture of two lenses: one data folder, in which each view shows the world's pattern."""
+    """A capture of two lenses becomes one data folder; each view shows the world's pattern."""
     panoramas = tmp_path / "photographs"
     names = write_panoramas(panoramas, 2)
     write_images(panoramas, ["DSC_0002.JPG"])
@@ -209,7 +209,7 @@ def test_panoramas_beside_photographs_become_views(tmp_path: Path) -> None:
 
 
 def test_a_fisheye_beside_a_photograph_has_as_many_views_as_asked_for(tmp_path: Path) -> None:
-    """Also where panoramas, of which there are none, would stay whole."""
+    """The setting that keeps panoramas whole does not change this, because there are none."""
     write_images(tmp_path / "photographs", NAMES[:2])
     sensors = sensor(0, "fisheye", programs.FISHEYE) + sensor(1, "frame", FRAME)
     cameras = camera(0, Path(NAMES[0]).stem) + camera(1, Path(NAMES[1]).stem, 1)

@@ -57,7 +57,7 @@ def test_the_cpu_asks() -> None:
 def test_training_with_room_learns_what_it_learns_without_and_says_what_was_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As long as there is enough; the sums of a step may be added up in another order."""
+    """Bits agree while there is room; the sums of a step may be added up in another order."""
     ahead(monkeypatch)
     asking, given = (trainer_of("gaussian-splatting", tmp_path / name) for name in ("asking", "given"))
     monkeypatch.setattr(asking.model.capacity, "read", lambda: None)

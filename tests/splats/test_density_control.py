@@ -1,4 +1,4 @@
-"""Growth by gradients: which Gaussians are cloned, split and dropped, and what the gradients are."""
+"""Growth by gradients: cloned, split and dropped Gaussians, and the gradients."""
 
 import dataclasses
 import math
@@ -56,7 +56,7 @@ def test_small_ones_are_cloned_and_large_ones_split() -> None:
 
 
 def test_children_are_spread_as_their_parent_is() -> None:
-    """Their centres have its covariance, within what 20,000 of them allow."""
+    """Their centres have its covariance, within the error of 20,000 samples."""
     torch.manual_seed(1)
     turn = torch.tensor([[0.9, 0.1, -0.3, 0.2]])
     scales = torch.tensor([[0.1, 0.3, 0.02]])
@@ -107,7 +107,7 @@ def test_nothing_to_do() -> None:
 
 
 def test_absolute_gradients_do_not_cancel() -> None:
-    """Of a Gaussian in the middle of a symmetric loss the position's gradient is 0; that of its halves is not."""
+    """In the middle of a symmetric loss, the gradient of a Gaussian's position is 0; its halves' gradients are not."""
     one = splat_camera(camera(), 0.1)
     round_one = dataclasses.replace(ball(logit=0.0), log_scales=torch.full((1, 3), math.log(0.2)))
     records = RASTERISER.project(round_one, one).records.detach().requires_grad_()

@@ -1,4 +1,4 @@
-"""The distortion of drawn Gaussians: its moments against pairs, what is drawn of it, and what it teaches."""
+"""The distortion of drawn Gaussians: its moments against pairs, its pictures, and its effect in training."""
 
 import dataclasses
 
@@ -88,7 +88,7 @@ def test_what_is_drawn_is_the_sum_over_pairs_of_gaussians(kind: torch.dtype) -> 
 
 
 def test_it_has_the_gradient_of_finite_differences() -> None:
-    """By positions, opacities and sizes, in float64."""
+    """The gradients by positions, opacities and sizes are compared, in float64."""
     still, view = behind_each_other(), small_camera()
     leaves = [values.clone().requires_grad_() for values in (still.means, still.logits, still.log_scales)]
 

@@ -331,7 +331,7 @@ def test_spz_looks_like_the_ply_of_the_same_scene(tmp_path: Path) -> None:
     ply, spz = gaussians_in(tmp_path / "a.ply"), gaussians_in(tmp_path / "a.spz")
     for direction in directions(5):
         torch.testing.assert_close(seen(spz, direction), seen(ply, direction))
-    # In the file itself, whose y and z are turned around, what d showed is shown by the turned d.
+    # The file itself has y and z turned around, so the turned d shows the colour of d.
     signs = torch.tensor(SIGNS).double()
     for direction in directions(5):
         turned = published(direction * torch.tensor([1.0, -1, -1]).double())
@@ -487,7 +487,7 @@ def test_what_is_no_similarity_is_refused() -> None:
 @pytest.mark.parametrize("suffix", ["ply", "spz"])
 def test_max_megabytes_holds_and_no_more_is_given_up_than_needed(tmp_path: Path, suffix: str) -> None:
     gaussians, file = some(4000), tmp_path / f"a.{suffix}"
-    gaussians.colors.clamp_(-3, 3)  # what SPZ holds
+    gaussians.colors.clamp_(-3, 3)  # the range of SPZ
     gaussians.harmonics.clamp_(-1, 1)
     assert write_gaussians(file, gaussians, 100.0) == []
     whole = file.stat().st_size
@@ -635,7 +635,7 @@ def test_ns_export(
 def test_ns_export_near_the_origin_writes_what_it_always_wrote(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, unit: float
 ) -> None:
-    """In any unit that the format can hold: the Gaussians in the frame of the input, and no file beside."""
+    """The Gaussians are in the frame of the input, without a second file, in any unit that the format can hold."""
     if suffix == "spz" and unit > 1e5:
         return  # SPZ holds positions up to 8,388,607
     placement = Placement(torch.cat([turn(), unit * torch.tensor([[1.0], [2.0], [3.0]]).double()], -1), 0.25 / unit)

@@ -1,4 +1,4 @@
-"""Flat Gaussians along surfaces: the terms by closed forms, what is drawn of normals, and what it teaches."""
+"""Flat Gaussians along surfaces: the terms by closed forms, pictures of normals, and their effect in training."""
 
 import dataclasses
 import math
@@ -50,7 +50,7 @@ def plane(normal: Tensor) -> Tensor:
 
 
 def image_of_a_plane(opacity: float, angle: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """An image of a plane whose drawn normals are off by an angle: normals, distances, transmittance, directions."""
+    """An image of a plane with drawn normals off by an angle: normals, distances, transmittance, directions."""
     aside = torch.nn.functional.normalize(torch.linalg.cross(NORMAL, torch.eye(3).double()[0]), dim=0)
     shown = math.cos(angle) * NORMAL + math.sin(angle) * aside
     through = torch.full((SIDE, SIDE), 1 - opacity, dtype=torch.float64)
@@ -86,7 +86,7 @@ def test_the_error_of_normals_in_closed_form(opacity: float, angle: float) -> No
 
 
 def test_normals_of_what_is_transparent_or_left_out_do_not_count() -> None:
-    """Neither do their neighbours, whose normals depend on these distances."""
+    """Neither do their neighbours, because their normals depend on these distances."""
     assert float(normal_error(*image_of_a_plane(0.4, 0.5))) == 0
     expected = 0.8 * (1 - math.cos(0.5))
     normals, distances, through, rays = image_of_a_plane(0.8, 0.5)
@@ -124,7 +124,7 @@ def test_normals_are_drawn_as_pictures_show_them() -> None:
 
 
 def test_drawn_normals_have_the_gradient_of_finite_differences() -> None:
-    """By rotations and positions, in float64; no Gaussian is nearly edge-on."""
+    """The gradients by rotations and positions are compared, in float64; no Gaussian is nearly edge-on."""
     torch.manual_seed(3)
     size = torch.tensor([9])
     small = Cameras(camera().camera_to_worlds, *(torch.tensor([v]) for v in (10.0, 10.0, 4.5, 4.5)), size, size)
@@ -151,7 +151,7 @@ def photograph() -> ViewBatch:
 
 
 def test_the_smallest_scale_is_penalised_in_extents() -> None:
-    """Of the ball's scales 0.2, 0.2 and 0.01 the last alone gets a gradient; it is that of its logarithm."""
+    """Only the last of the ball's scales 0.2, 0.2 and 0.01 gets a gradient; it is the gradient of its logarithm."""
     model = model_of(ball(), camera(), flatness_penalty=2.0)
     term, expected = model.loss(photograph(), 0).terms["flatness"], 2.0 * 0.01 / float(model.extent)
     assert float(term.detach()) == pytest.approx(expected)

@@ -1,4 +1,4 @@
-"""Files of other programs: .splat, compressed PLY, Mip-Splatting's filter, and what cannot be read."""
+"""Files of other programs: .splat, compressed PLY, Mip-Splatting's filter, and unreadable files."""
 
 import math
 import struct
@@ -139,7 +139,7 @@ def ply(
 
 @pytest.mark.parametrize("name", ["filter_3D", "filter_3d"])
 def test_the_filter_of_mip_splatting_is_a_part_of_the_gaussian(tmp_path: Path, name: str) -> None:
-    """Its covariance grows by that of a ball, and its light, opacity times the root of the determinant, stays."""
+    """Its covariance grows by a ball's, and its light, opacity times the root of the determinant, stays."""
     given = some(40, 1).map(lambda values: values.clone())
     filters = torch.rand(40, generator=torch.Generator().manual_seed(3)) * 0.1
     filters[0] = 0.0
@@ -156,7 +156,7 @@ def test_the_filter_of_mip_splatting_is_a_part_of_the_gaussian(tmp_path: Path, n
     torch.testing.assert_close(light(read, larger), light(given, covariances(given)), rtol=1e-4, atol=0)
     torch.testing.assert_close(read.logits[0], given.logits[0], rtol=1e-5, atol=1e-5)
     file.write_bytes(ply(given, {name: filters.tolist()}, ("SplatRenderMode: default", "SplatBlur: 0.3")))
-    assert read_gaussians(file).look == ELSEWHERE  # what the file says counts
+    assert read_gaussians(file).look == ELSEWHERE  # the file decides
 
 
 def test_discs_are_refused(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ COMMENTS = {
     ("SplatRenderMode: default", "SplatSort: distance"): OURS,
     (): ELSEWHERE,
 }
-"""What a file says of how it is drawn."""
+"""Settings of drawing in a file."""
 
 
 @pytest.mark.parametrize("comments", COMMENTS)

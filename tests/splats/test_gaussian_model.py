@@ -58,7 +58,7 @@ def test_there_are_enough_changes_to_reach_the_maximum() -> None:
 
 @pytest.mark.parametrize(("given", "expected"), [({}, MIN_STEPS), ({"steps_per_move": 40}, 40)])
 def test_a_slow_run_changes_the_number_more_often(given: dict[str, Any], expected: int) -> None:
-    """A second a step leaves 50 steps: far too few for changes each 100 steps, whatever was expected."""
+    """A second a step leaves 50 steps: far too few for changes each 100 steps, for any expectation."""
     config, _ = decide_splatting(SplattingConfig(max_seconds=60.0, start_gaussians=100, **given), SCENE)
     model = Plain(config, SCENE)
     assert model.steps_per_move == given.get("steps_per_move", MAX_STEPS)

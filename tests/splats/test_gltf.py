@@ -1,4 +1,4 @@
-"""glTF files with KHR_gaussian_splatting, read by struct and json alone, and what is up in them."""
+"""glTF files with KHR_gaussian_splatting, read by struct and json alone, and their up direction."""
 
 import json
 import struct

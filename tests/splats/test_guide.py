@@ -1,4 +1,4 @@
-"""Distances that a field has found: which pixels have them, when they count, and what they do to Gaussians."""
+"""Distances that a field has found: the pixels that have them, when they count, and their effect on Gaussians."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Training with a memory limit: a step changes what its image may show, as it would without, and nothing else."""
+"""Training with a memory limit: a step changes Gaussians that its image may show, as without a limit, and no others."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""gaussian-splatting as a method: what the budget decides, starts, masks, pictures, and checkpoints of other sizes."""
+"""gaussian-splatting as a method: choices by the budget, starts, masks, pictures, and checkpoints of other sizes."""
 
 import dataclasses
 from pathlib import Path
@@ -134,7 +134,7 @@ def test_masked_pixels_teach_nothing() -> None:
 
 
 def test_growth_asks_for_as_much_of_images_of_half_the_size() -> None:
-    """Image positions are in units of the image that was drawn: its size must not change what a Gaussian is to do."""
+    """Image positions are in units of the drawn image: its size must not change a Gaussian's growth."""
     torch.manual_seed(4)
     size = torch.tensor([64])
     large = Cameras(camera().camera_to_worlds, *(torch.tensor([v]) for v in (80.0, 80.0, 32.0, 32.0)), size, size)

@@ -1,4 +1,4 @@
-"""Gaussians that move: their equations, what they learn from moving discs, their growth, pictures, files and runs."""
+"""Gaussians that move: their equations, training on moving discs, their growth, pictures, files and runs."""
 
 import dataclasses
 import json
@@ -48,7 +48,7 @@ from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 MOVING = dataclasses.replace(SCENE, moving=True, num_times=8)
 FEW: dict[str, Any] = {"start": "random", "num_gaussians": 600, "start_gaussians": 400, "steps_per_move": 20}
 PLAIN: dict[str, Any] = {"opacity_penalty": 0.0, "scale_penalty": 0.0, "noise": 0.0, "appearance": "none"}
-"""Settings with which the loss is that of colours alone."""
+"""Settings with a loss of colours alone."""
 TIMES = [index / 7 for index in range(8)]
 BLACK = torch.zeros(3)
 
@@ -202,7 +202,7 @@ def test_the_penalty_counts_what_is_seen_and_shortens_no_duration() -> None:
 
 @pytest.mark.medium
 def test_moving_discs_are_followed() -> None:
-    """Two discs cross the image at 8 times. From where they are at half of the time, their paths are learnt.
+    """Two discs cross the image at 8 times. Their paths are learnt from their positions at half of the time.
 
     The largest distance from the true paths falls below 0.08 units, 1.1 pixels; at the start it is 0.45.
     """
@@ -242,7 +242,7 @@ def test_moving_discs_are_followed() -> None:
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc", "relocation"])
 def test_growth_keeps_the_columns_of_a_gaussian_together(strategy: str) -> None:
-    """Copies move as what they are copies of."""
+    """Copies move as their originals."""
     config = dataclasses.replace(METHOD.config, **FEW, strategy=strategy, steps_per_reset=10**6)
     found, count = Learner(METHOD, config, moving_ball(), 0), 400
     model = found.model
@@ -413,7 +413,7 @@ def test_times_that_cannot_be_exported_are_refused(
 
 @pytest.fixture
 def moving_data(tiny: Path, edit_json: EditJson) -> Path:
-    """The tiny data set, whose images are of ten times."""
+    """The tiny data set, with images of ten times."""
     edit_json(lambda content: [frame.update(time=index / 9) for index, frame in enumerate(content["frames"])])
     return tiny
 

@@ -1,4 +1,4 @@
-"""Codebooks and palettes: errors stay below what is stated, and the same values have the same palette."""
+"""Codebooks and palettes: errors stay below the stated bounds, and the same values have the same palette."""
 
 import numpy as np
 import pytest

@@ -36,7 +36,7 @@ def test_every_picture_is_the_first() -> None:
 
 
 def test_pictures_by_depth() -> None:
-    """Of two Gaussians one is nearer along the axis, the other to the camera; packed or not, the former is in front."""
+    """One Gaussian is nearer along the axis, the other to the camera; packed or not, the former is in front."""
     pair = dataclasses.replace(
         ball(),
         means=torch.tensor([[0.0, 0.0, 0.05], [0.9, 0.0, 0.1]]),

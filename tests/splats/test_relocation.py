@@ -36,7 +36,7 @@ def test_scores_are_the_weighted_sum_of_relative_gradients_and_opacities() -> No
 
 
 def test_large_gradients_are_chosen_more_often() -> None:
-    """Of two as opaque, in proportion to their scores: 0.5 and 1.5."""
+    """Two equally opaque ones are chosen in proportion to their scores: 0.5 and 1.5."""
     torch.manual_seed(1)
     gaussians = some(4_000, torch.zeros(4_000))
     gradients = torch.tensor([0.0, 2e-4]).repeat(2_000)

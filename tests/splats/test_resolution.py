@@ -75,7 +75,7 @@ def test_fewer_steps_at_full_size_leave_more_time_for_small_ones() -> None:
 
 
 def run(sizes: ImageSizes, seconds_of: dict[int, float], budget: float) -> list[int]:
-    """Return the octaves of each step of a run whose steps take these seconds by their octaves."""
+    """Return the octaves of each step of a run; a step takes the seconds of its octaves."""
     step, seconds, taken = 0, 0.0, []
     while seconds < budget:
         sizes.learn(Pace(step, seconds, budget))
@@ -127,7 +127,7 @@ def test_a_run_that_becomes_slower_waits_longer_for_full_size() -> None:
 
 
 def test_steps_to_come_are_counted_at_the_times_of_their_sizes() -> None:
-    """What is expected after each size has been measured is what the rest of the run then has."""
+    """The number expected after each size has been measured is the number of the rest of the run."""
     sizes, seconds_of = ImageSizes(REDUCED_SHARE, 3, True), {0: 0.08, 1: 0.04, 2: 0.02, 3: 0.01}
     assert sizes.steps_until(Pace(0, 0.0, 60.0), 0.8) is None
     run(sizes, seconds_of, 60.0)

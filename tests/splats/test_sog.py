@@ -1,4 +1,4 @@
-"""SOG files: bytes by hand are the truth, what is written comes back as exact as stated, and damage is refused."""
+"""SOG files: bytes by hand are the truth, written Gaussians come back as exact as stated, and damage is refused."""
 
 import io
 import json
@@ -31,7 +31,7 @@ def webp(pixels: object, width: int, kind: str = "WEBP") -> bytes:
 
 
 def by_hand(kind: str = "WEBP") -> tuple[dict[str, Any], dict[str, bytes]]:
-    """What meta.json says, and the images, of two Gaussians of degree 1."""
+    """meta.json and the images of two Gaussians of degree 1."""
     images = {
         "low.webp": webp([[255, 0, 0x34, 255], [0, 0, 0, 255]], 2, kind),
         "high.webp": webp([[255, 0, 0x12, 255], [0, 255, 0, 255]], 2, kind),
@@ -96,7 +96,7 @@ def test_what_is_in_a_file_by_hand(tmp_path: Path, how: str) -> None:
 
 
 def test_a_codebook_without_its_first_number(tmp_path: Path) -> None:
-    """As early programs wrote it: the number is a step before the second, as in PlayCanvas's engine."""
+    """Early programs wrote it so: the number is a step before the second, as in PlayCanvas's engine."""
     meta, images = by_hand()
     whole = read_gaussians(write(tmp_path / "a.sog", meta, images)).gaussians
     codes = meta["scales"]["codebook"]
@@ -108,7 +108,7 @@ def test_a_codebook_without_its_first_number(tmp_path: Path) -> None:
 
 
 def matched(read: Gaussians, given: Gaussians) -> Gaussians:
-    """The given Gaussians in the order of those that were read: each is the nearest."""
+    """The given Gaussians in the order of the read ones: each is the nearest."""
     nearest = torch.cdist(read.means.double(), given.means.double()).argmin(1)
     assert nearest.sort().values.tolist() == list(range(len(given)))
     return given[nearest]
@@ -267,7 +267,7 @@ def test_damaged_descriptions_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "a.sog"
 
     def said(key: str, value: object) -> str:
-        """With another value at a path of names, or without it for None."""
+        """The error for another value at a path of names, or for none if None."""
         meta, images = by_hand()
         *above, last = key.split(".")
         place = meta

@@ -119,7 +119,7 @@ def test_a_file_is_drawn_as_its_run(kind: str, capture: Path, tmp_path: Path) ->
 
 
 def test_files_of_other_programs_stand_for_a_run(capture: Path, capture_run: Path, tmp_path: Path) -> None:
-    """A .splat file is loaded, and what cannot be read is named, not taken for settings."""
+    """A .splat file is loaded, and an unreadable file is named, not taken for settings."""
     called("ns-export", "gaussian-splat", capture_run, "--output-dir", tmp_path)
     given = read_gaussians(tmp_path / "splat.ply").gaussians
     write_splat(tmp_path / "a.splat", given)

@@ -1,4 +1,4 @@
-"""SPZ of versions 1, 3 and 4: bytes by hand, and what is written, unpacked without our reader."""
+"""SPZ of versions 1, 3 and 4: bytes by hand, and written files, unpacked without our reader."""
 
 import gzip
 import struct
@@ -29,7 +29,7 @@ def frame(content: bytes) -> bytes:
 
 
 def by_hand(degree: int = 1, flags: int = 0, extensions: bytes = b"", version: int = 4) -> bytes:
-    """One Gaussian, that of `body`, in the layout of version 4."""
+    """The Gaussian of `body`, in the layout of version 4."""
     content = body(ROTATION, bytes(range(100, 109)) if degree else b"")
     cuts = [sum(WIDTHS[:index]) for index in range(len(WIDTHS) + 1)] + ([len(content)] if degree else [])
     arrays = [content[start:end] for start, end in pairwise(cuts)]
@@ -55,7 +55,7 @@ def test_version_4_by_hand(tmp_path: Path, degree: int) -> None:
 
 
 def test_version_1_by_hand(tmp_path: Path) -> None:
-    """Positions are half floats, and rotations those of version 2."""
+    """Positions are half floats, and rotations as in version 2."""
     later = body(bytes([255, 127, 128]))
     (tmp_path / "a.spz").write_bytes(packed(1, 1, 0, struct.pack("<3e", 1.5, -2, 0.25) + later[9:]))
     (tmp_path / "b.spz").write_bytes(packed(2, 1, 0, later))
@@ -104,7 +104,7 @@ def test_what_is_written_holds_the_arrays_of_version_3(degree: int) -> None:
 @pytest.mark.parametrize("version", [3, 4])
 def test_written_rotations_are_off_by_a_third_of_a_degree_at_most(tmp_path: Path, version: SpzVersion) -> None:
     gaussians, file = some(20_000, 0), tmp_path / "a.spz"
-    gaussians.colors.clamp_(-3, 3)  # what SPZ holds
+    gaussians.colors.clamp_(-3, 3)  # the range of SPZ
     assert write_gaussians(file, gaussians, spz_version=version) == []
     read = read_gaussians(file).gaussians
     off = float(angles(read, gaussians).max())
@@ -140,7 +140,7 @@ def test_truncated_version_4_is_refused_wherever_it_ends(tmp_path: Path) -> None
 
 
 def test_version_4_with_a_wrong_byte_is_refused(tmp_path: Path) -> None:
-    """In the arrays, which have checksums."""
+    """The wrong byte is in the arrays, which have checksums."""
     whole, file = encoded(some(300), version=4), tmp_path / "a.spz"
     start = struct.unpack_from("<I", whole, 16)[0] + 6 * 16
     for place in range(start, len(whole), 61):

@@ -48,7 +48,7 @@ def test_morton_interleaves_bits() -> None:
 
 
 def test_too_many_points_are_thinned_evenly() -> None:
-    """In the order of a scanner's lines, with a tenth of them in a corner: 1 in 20 of every part of space is kept."""
+    """Points are in a scanner's order, a tenth of them in a corner: 1 in 20 of every part of space is kept."""
     torch.manual_seed(0)
     points = torch.cat([torch.rand(18_000, 3), 0.1 * torch.rand(2_000, 3) + 5]).sort(0).values
     assert thinned(points, 20_000) is points

@@ -1,4 +1,4 @@
-"""Gaussians that are read in parts are those that are read at once."""
+"""Gaussians read in parts equal Gaussians read at once."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -142,7 +142,7 @@ def test_a_pose_that_is_off_is_found(group: str) -> None:
 @pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
 @pytest.mark.parametrize("harmonics", [0, 15])
 def test_the_gradient_of_a_motion_is_that_of_differences(harmonics: int, group: Group) -> None:
-    """In float64, through the centres, shapes, distances and colours of 50 Gaussians."""
+    """The gradient goes through the centres, shapes, distances and colours of 50 Gaussians, in float64."""
     torch.manual_seed(0)
     rows = [
         0.4 * torch.randn(50, 3), torch.randn(50, 3) / 2 - 2.5, torch.randn(50, 4), torch.randn(50) + 1,
@@ -174,7 +174,7 @@ def test_the_gradient_of_a_motion_is_that_of_differences(harmonics: int, group: 
 
 
 def test_a_step_moves_the_camera_of_its_image_alone() -> None:
-    """By the learning rate at first, as Adam does; a later step with another image moves it no further."""
+    """A first step moves by the learning rate, as Adam does; a later step with another image moves it no further."""
     three = camera()[torch.zeros(3, dtype=torch.long)]
     settings = {"camera_optimizer": "SO3xR3", "camera_learning_rate": 1e-3, "rate_factor": 4.0, "noise": 0.0}
     model = model_of(scattered(), three, **settings)
@@ -193,7 +193,7 @@ def test_a_step_moves_the_camera_of_its_image_alone() -> None:
 
 @pytest.mark.medium
 def test_steps_of_a_run_find_a_pose_that_is_off() -> None:
-    """By half a degree and a hundredth of the distance; images of a camera in its place come in between."""
+    """It is off by half a degree and a hundredth of the distance; images of a camera in its place come between."""
     true = camera()
     both = true.camera_to_worlds.repeat(2, 1, 1)
     turn = torch.linalg.matrix_exp(cross_matrix(torch.tensor([0.005, -0.0075, 0.0025])))
@@ -235,7 +235,7 @@ def test_other_cameras_follow_the_training_cameras() -> None:
 
 
 def test_known_depths_pull_gaussians_there() -> None:
-    """One Gaussian at distance 3, whose true distance is 2.5: the loss is its relative error, and moves it nearer."""
+    """One Gaussian at distance 3 has the true distance 2.5: the loss is its relative error, and moves it nearer."""
     one = camera()
     model = model_of(ball(), one, depth_loss_mult=1.0)
     known = torch.zeros(33, 33)
@@ -251,7 +251,7 @@ def test_known_depths_pull_gaussians_there() -> None:
 
 
 def test_the_background_of_a_capture_cannot_be_learnt() -> None:
-    """Each step has another, so that what is left transparent is wrong in the next."""
+    """Each step has another background, so transparent pixels are wrong in the next step."""
     captured = dataclasses.replace(SCENE, has_alpha=False)
     config, _ = METHOD.decided(GaussianSplattingConfig(num_gaussians=10, degree=0), captured)
     model = GaussianSplatting(config, captured)

@@ -48,7 +48,7 @@ def test_the_lens_decides() -> None:
 
 
 def test_panoramas_are_sorted_by_distance_whatever_gaussians_were_trained_with() -> None:
-    """Depth along an axis says nothing about what is beside or behind it."""
+    """Depth along an axis says nothing about Gaussians beside or behind it."""
     near, far = ball(means=torch.tensor([[3.0, 0.0, 3.0]])), ball(means=torch.tensor([[4.0, 0.0, 3.2]]))
     pair = Gaussians.joined([far, near])
     pair = replace(pair, log_scales=torch.full((2, 3), -1.0), colors=torch.tensor([[-1.0] * 3, [0.5 / DC] * 3]))

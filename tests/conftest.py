@@ -29,13 +29,13 @@ torch.set_num_threads(1)
 
 
 def pytest_configure() -> None:
-    """What is imported and collected stays: looking for garbage in it would take a third of the time."""
+    """Imported and collected objects stay: looking for garbage among them would take a third of the time."""
     gc.disable()
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish() -> None:
-    """From here on only what tests leave is looked through."""
+    """From here on only objects of tests are looked through."""
     gc.collect()
     gc.freeze()
     gc.enable()
@@ -173,7 +173,7 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 @pytest.fixture
 def ctrl_c_raises() -> Iterator[None]:
-    """As in a terminal. What a shell starts in the background has it ignored."""
+    """Handle Ctrl-C as in a terminal; a shell makes programs in the background ignore it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -1,8 +1,8 @@
 """Python programs in processes of their own that share one import of torch, which takes more than a second.
 
 They are forked from a process that has done nothing else. So they can die, and depend on variables of the environment;
-but torch's own variables, such as those of OpenMP, it has read already, and programs about what is imported belong into
-a process from its start.
+but torch's own variables, such as those of OpenMP, it has read already, and programs about imports belong into a
+process of their own from its start.
 """
 
 import json
@@ -21,15 +21,15 @@ from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[1]
 Program = tuple[str, Sequence[object], dict[str, str]]
-"""Code, its arguments, and variables besides those of this process."""
+"""Code, its arguments, and variables besides this process's."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """What became of a program."""
+    """The end of a program."""
 
     returncode: int
-    """As of `subprocess`: less than 0 is the number of the signal that ended it."""
+    """As in `subprocess`: less than 0 is the number of the signal that ended it."""
     stdout: str
     stderr: str
 
@@ -99,7 +99,7 @@ def _become(code: str, arguments: list[str], environment: dict[str, str], files:
 
 
 def _ended(process: int, files: list[IO[bytes]]) -> tuple[Any, ...]:
-    """Its exit status, and what it said."""
+    """Its exit status, and its output."""
     status = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
     said = []
     for file in files:

@@ -13,7 +13,7 @@ from nerfloom.data.scene import Scene
 Capsule = tuple[tuple[float, float, float], tuple[float, float, float], float]
 """Both ends of the axis, and the radius: of a ball the ends are one."""
 Motion = Callable[[float], list[Capsule]]
-"""What moves, at a time from 0 to 1."""
+"""Moving bodies, at a time from 0 to 1."""
 BOX = torch.tensor([[-1.5] * 3, [1.5] * 3])
 STILL: Capsule = ((0.0, 0.0, -0.9), (0.0, 0.0, -0.9), 0.35)
 """A ball that stays, in all images."""
@@ -91,12 +91,12 @@ def photographed(motion: Motion, count: int, size: int = 100, seed: int = 0) -> 
 
 
 def lost(hulls: Tensor, box: Tensor, motion: Motion, points: int = 500, moments: int = 101) -> float:
-    """The largest share, at any of many moments, of positions in what moves that are outside the hull of their time.
+    """The largest share, over many moments, of positions in moving bodies that are outside the hull of their time.
 
     Args:
         hulls: (T, n, n, n) bool.
         box: (2, 3) box of the hulls.
-        motion: what moves.
+        motion: the moving bodies.
         points: number of random positions in each body at each moment.
         moments: number of times, evenly from 0 to 1.
     """

@@ -1,7 +1,7 @@
 """A device in the place of a GPU: torch's "meta", with values behind its tensors, which the CPU computes.
 
-As on a GPU, an operation takes tensors of one device: those of the CPU are refused beside them, but for numbers and
-indices. What only CUDA itself knows (streams, graphs, its kernels) is not imitated.
+As on a GPU, an operation takes tensors of one device: tensors of the CPU are refused beside them, except numbers and
+indices. Functions of CUDA alone (streams, graphs, its kernels) are not imitated.
 """
 
 from collections import Counter
@@ -18,18 +18,18 @@ from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 from benchmarks.operations import _place, _waits
 
 OTHER = torch.device("meta", 1)
-"""Not "meta" itself: what is kept for a device would reach tests on that, whose tensors have no values."""
+"""Not "meta" itself: caches by device would reach tests on that device, which has tensors without values."""
 BRING = {"aten::copy_", "aten::_to_copy"}
 """Operations that take tensors of both devices."""
 INDEX = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
-"""Operations whose indices may be on the CPU."""
+"""Operations with indices that may be on the CPU."""
 
 
 class There(Tensor):
     """A tensor of the other device."""
 
     values: Tensor
-    """What it holds, on the CPU."""
+    """Its values, on the CPU."""
 
     @staticmethod
     def __new__(cls, values: Tensor) -> "There":
@@ -105,7 +105,7 @@ def computed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 class OtherDevice(TorchDispatchMode):
-    """Computes what is on the other device, and counts by place what Python waits for."""
+    """Computes operations of the other device, and counts Python's waits by place."""
 
     def __init__(self) -> None:
         super().__init__()

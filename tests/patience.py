@@ -1,11 +1,11 @@
-"""How long what should come is waited for: against hanging alone, as no test is about speed."""
+"""The time to wait for an expected event: against hanging alone, as no test is about speed."""
 
 import time
 from collections.abc import Callable
 from typing import TypeVar
 
 PATIENCE = 600.0
-"""Seconds after which a test takes what it waits for as hanging."""
+"""Maximum seconds of waiting; then a test counts the event as hanging."""
 Found = TypeVar("Found")
 
 

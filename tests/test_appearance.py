@@ -1,4 +1,4 @@
-"""How much light differs: told from what is seen, in stops that can be computed by hand."""
+"""The spread of light, measured from points seen, in stops that can be computed by hand."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The house: imports run one way, files and functions stay small, everything public says what it is."""
+"""The house: imports run one way, files and functions stay small, everything public has a docstring."""
 
 import ast
 import functools
@@ -172,7 +172,7 @@ LAYERS = (
 
 
 def _room(module: str) -> int | None:
-    """The place of a module's room in LAYERS; None for what is none of ours."""
+    """The place of a module's room in LAYERS; None for other packages."""
     parts = module.split(".")
     if parts[0] != "nerfloom" or len(parts) < 2:
         return None
@@ -191,7 +191,7 @@ def test_imports_run_one_way_through_the_rooms() -> None:
     for file in FILES:
         module = module_of(file)
         level = _room(module)
-        if level is None or module == "nerfloom.registry":  # it finds what stands above it by name
+        if level is None or module == "nerfloom.registry":  # it finds modules above it by name
             continue
         for name in sorted(_runtime_imports(tree(file))):
             other = _room(name)
@@ -230,7 +230,7 @@ def test_names_are_imported_from_the_file_that_defines_them() -> None:
 
 
 def test_no_import_circles() -> None:
-    """At whatever place in a file: an import in a function is late, and hides a circle."""
+    """Imports anywhere in a file count: an import in a function is late, and hides a circle."""
     names = {module_of(file): file for file in FILES if file.name != "__init__.py"}
     edges = {name: _runtime_imports(tree(file)) & names.keys() for name, file in names.items()}
     finished: set[str] = set()

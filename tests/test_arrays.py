@@ -1,4 +1,4 @@
-"""numpy's files of an array: what they hold is read, and no more memory is asked for than they have bytes."""
+"""numpy's files of an array: their content is read, and no more memory is allocated than they have bytes."""
 
 import tracemalloc
 from pathlib import Path
@@ -25,7 +25,7 @@ CLAIMS = {
     "a gigabyte of numbers": (b"(3,), }" + 8 * b" ", b"(125000000,), }"),
     "a header of three gigabytes": (b"\x93NUMPY\x01\x00v\x00{'", b"\x93NUMPY\x02\x00v\x00{\xbb"),
 }
-"""In a file of 152 bytes: what stands there, and what is put in its place."""
+"""Bytes of a file of 152 bytes, and their replacements."""
 
 
 @pytest.mark.parametrize("claim", CLAIMS)

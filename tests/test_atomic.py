@@ -8,7 +8,7 @@ from nerfloom.base.atomic import write_atomically
 
 
 def test_two_threads_write_one_file(tmp_path: Path) -> None:
-    """As two browsers of a viewer do. The one that ends last has its content there, and nothing else is left."""
+    """Two browsers of a viewer do so. The file has the content of the last writer, and no other file is left."""
     file = tmp_path / "crop.yaml"
 
     def write_during_another(stream: BinaryIO) -> None:

@@ -1,4 +1,4 @@
-"""camera_path.json: nerfstudio's conventions worked out again, what is written is read, what is wrong is refused."""
+"""camera_path.json: nerfstudio's conventions worked out again, written files are read, and faults are refused."""
 
 import json
 import math
@@ -27,7 +27,7 @@ def turned(angle: float, x: float = 0.5, y: float = -1.0, z: float = 2.0) -> np.
 
 
 def viewers_file(**changes: Any) -> dict[str, Any]:
-    """What nerfstudio's viewer writes for two keyframes and three frames, by the keys of its render panel."""
+    """The file of nerfstudio's viewer for two keyframes and three frames, by the keys of its render panel."""
     frames = [
         {"camera_to_world": turned(0.1 * i).flatten().tolist(), "fov": 50.0 + i, "aspect": 16 / 9} for i in range(3)
     ]
@@ -114,7 +114,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
 
 
 def nerfstudio_placement(poses: np.ndarray) -> tuple[np.ndarray, float]:
-    """What nerfstudio's auto_orient_and_center_poses (up, poses) and auto_scale_poses do, from their description."""
+    """nerfstudio's auto_orient_and_center_poses (up, poses) and auto_scale_poses, from their description."""
     up = poses[:, :3, 1].mean(0)
     up /= np.linalg.norm(up)
     z = np.array([0.0, 0.0, 1.0])
@@ -140,7 +140,7 @@ def test_a_path_of_nerfstudios_viewer_lands_right_in_a_capture(tmp_path: Path) -
 
 
 def test_a_path_fits_a_run_that_is_placed_in_another_way(tmp_path: Path) -> None:
-    """What a point of the input's pixel is stays the same."""
+    """The pixel of a point of the input stays the same."""
     folder = write_capture(tmp_path / "capture")
     one, other = (Nerfstudio(orientation_method=way).parse(folder, "train") for way in ("up", "none"))  # type: ignore[arg-type]
     assert one.transform is not None

@@ -227,7 +227,7 @@ class BottomlessPicture:
 
 
 class LosesEveryRow:
-    """Draws all pixels, whatever the view leaves out."""
+    """Draws all pixels, also the ones that the view leaves out."""
 
     def render_view(self, view: View, background: Tensor) -> Picture:
         return super().render_view(dataclasses.replace(view, stride=1), background)
@@ -368,7 +368,7 @@ class RemembersATint:
 
 
 class CountsForItself:
-    """What it minimises depends on how often this very object was called."""
+    """Its objective depends on the number of calls of this very object."""
 
     calls = 0
 
@@ -407,7 +407,7 @@ EITHER: list[tuple[str, type, str]] = [
     ("checkpoint", RemembersATint, r"renders another picture \(rgb\)"),
     ("checkpoint", CountsForItself, "a step after a checkpoint was loaded"),
 ]
-"""A check, what it finds wrong, whatever kind of model it is mixed into, and words of the finding."""
+"""A check, its fault for models of any kind, and words of the finding."""
 
 # -- what can be wrong with one kind ----------------------------------------------------------------------------------
 
@@ -463,7 +463,7 @@ class ForgetsTheBackground(VolumeRenderer):
 
 
 class Fog(VolumeRenderer):
-    """Halves what is behind every ray, whether it meets the box or not."""
+    """Halves the background behind every ray, whether it meets the box or not."""
 
     def render(self, rays: Rays, samples: Samples, field: Field, background: Tensor) -> Rendered:
         rendered = super().render(rays, samples, field, background / 2)
@@ -471,7 +471,7 @@ class Fog(VolumeRenderer):
 
 
 class RayError(LossTerm):
-    """Compares what rays show with what their pixels do."""
+    """Compares rays with their pixels."""
 
     def __call__(self, shown: RenderedBatch) -> Tensor:
         return (shown.rendered.rgb - shown.batch.rgb).square().mean()
@@ -549,7 +549,7 @@ OF_RAYS: list[tuple[str, type, Any, str]] = [
 
 
 class FogInFront(Discs):
-    """Halves what is behind, and does not say so."""
+    """Halves the background, and does not say so."""
 
     def draw(self, view: View, background: Tensor) -> Picture:
         return super().draw(view, background / 2)
@@ -580,7 +580,7 @@ NAMES = [
 
 
 def with_what_they_need(*wanted: str) -> tuple[Check, ...]:
-    """Checks and those before them without which they are not made."""
+    """Checks, and the checks before them that they depend on."""
     names = set(wanted)
     for check in reversed(CHECKS):
         names |= set(check.needs) if check.name in names else set()
@@ -612,7 +612,7 @@ def test_each_fault_is_found_by_its_check_alone(check: str, method: Method, word
 
 
 def test_every_check_has_a_fault_that_shows_it_works() -> None:
-    """Of methods that cast rays, and, where it is made of these, of methods that draw whole images."""
+    """The faults are in methods that cast rays, and, for checks of these, in methods that draw whole images."""
     found = {kind: {"summary"} for kind in ("pixels", "views")}
     for check, method, _ in FAULTS:
         found[getattr(method.model, "batches", "pixels")].add(check)

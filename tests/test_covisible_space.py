@@ -85,7 +85,7 @@ def test_nothing_is_left_out_before_the_cameras_are_known_and_none_beyond_the_bo
 
 
 def test_cells_are_counted_whose_points_are_all_seen() -> None:
-    """Random points of each box, projected in float64: those in a cell that k images show are on k images at least."""
+    """Random points of each box, projected in float64: points in a cell that k images show are on k images at least."""
     cameras = row(0.0, 0.4, -0.7)
     generator = torch.Generator().manual_seed(0)
     shown = missed = 0
@@ -187,8 +187,8 @@ def test_without_points_scenes_that_move_and_several_start_at_the_near_ends(
 def test_the_share_of_rays_that_start_late_is_that_of_the_geometry() -> None:
     """Two cameras at the distance 1 look at the origin from +-40 degrees.
 
-    The rays start late that are nowhere before 0.8 in both images, and more of them, as a cell counts as seen where
-    all of its ball is; fewer than those that are nowhere before 0.9 by a cell's diagonal within both.
+    Rays start late if they are nowhere before 0.8 in both images. There are more, because a cell counts as seen where
+    all of its ball is seen; but fewer than the rays that are nowhere before 0.9 by a cell's diagonal within both.
     """
     cameras, space = around(1.0, -40, 40), CovisibleSpace(BOX / 4)
     cameras = dataclasses.replace(cameras, fx=4 * cameras.fx, fy=4 * cameras.fy)
@@ -238,7 +238,7 @@ def test_known_points_decide_whether_rays_start_late(distance: float, least: int
     said = [decision.line() for decision in made if decision.option == "rays start"]
     assert len(said) == (not least)
     assert all("at their near ends" in line and "% of the points" in line for line in said)
-    for chosen in (0, 2):  # what one asks for is done
+    for chosen in (0, 2):  # an explicit choice is kept
         asked = dataclasses.replace(config, rays_shared_by=chosen)
         assert decided(METHOD, asked, dataset)[1].rays_shared_by == chosen
 

@@ -1,4 +1,4 @@
-"""What --data may name besides a data folder: parts of one, photographs, videos, nothing."""
+"""Values of --data besides a data folder: parts of one, photographs, videos, nothing."""
 
 import shlex
 import shutil
@@ -18,7 +18,7 @@ def test_a_part_of_a_data_folder_stands_for_it(part: str, shared_tiny: Path) -> 
 
 
 def test_what_is_called_otherwise_stands_for_itself(tiny: Path) -> None:
-    """Photographs that happen to lie in a data folder are not what was trained on before."""
+    """Photographs in a data folder do not stand for that folder."""
     shutil.copytree(tiny / "train", tiny / "new photographs")
     with pytest.raises(DataError, match="there are 10 images, but no camera poses"):
         find_data(tiny / "new photographs")
@@ -29,7 +29,7 @@ def test_what_is_called_otherwise_stands_for_itself(tiny: Path) -> None:
 
 
 def advised(path: Path) -> list[str]:
-    """The words of the command in what is said of a path."""
+    """The command in the message about a path."""
     with pytest.raises(DataError) as error:
         find_data(path)
     return shlex.split(str(error.value).partition("Estimate them first: ")[2].partition(" (then: ")[0])

@@ -1,4 +1,4 @@
-"""Images in memory: what is decoded is what was stored, hand-computed where it is changed."""
+"""Images in memory: decoded values equal the stored ones, or values computed by hand."""
 
 import os
 import struct
@@ -84,7 +84,7 @@ def test_an_image_without_a_pixel(tmp_path: Path, size: tuple[int, int]) -> None
 
 @pytest.mark.skipif(os.name != "posix", reason="puts a shell script in the way")
 def test_no_program_is_run_for_an_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pillow has PostScript drawn by Ghostscript, and knows it by its content, whatever the file is called."""
+    """Pillow has PostScript drawn by Ghostscript, and recognises it by its content, under any name."""
     program = tmp_path / "bin" / "gs"
     program.parent.mkdir()
     program.write_text(f"#!/bin/sh\ntouch {tmp_path / 'proof'}\n")

@@ -24,7 +24,7 @@ class OpenConfig(TrainConfig):
     fancy: Auto[bool] = AUTO
     """Whether fancy."""
     shape: Auto[Literal["ball", "box"]] = AUTO
-    """Of what it is."""
+    """Its kind."""
 
 
 CHOICES = (
@@ -46,7 +46,7 @@ def test_what_is_open_is_filled_in_and_reported() -> None:
 
 
 def test_what_is_given_stays_and_is_not_reported() -> None:
-    """Also what Python takes for false, which is not open."""
+    """This holds for values that Python takes for false, too."""
     given = OpenConfig(num_cells=0, shape="box", learning_rate=0.3)
     config, made = fill(given, *CHOICES)
     assert config == dataclasses.replace(given, fancy=False)
@@ -68,7 +68,7 @@ def test_filling_in_twice_changes_nothing() -> None:
 @pytest.mark.parametrize("method", registered("methods"))
 @pytest.mark.parametrize("facts", [{}, {"unbounded": True, "appearance_varies": True, "poses": "device"}])
 def test_every_method_decides_once(method: str, facts: dict) -> None:
-    """What was decided is complete and stands: read from a run's config.yml, it is not decided anew."""
+    """Decisions are complete and stay: read from a run's config.yml, they are not made anew."""
     loaded, scene = load_method(method), dataclasses.replace(SCENE, **facts)
     config, _ = loaded.decided(loaded.config, scene)
     assert not [name for name in ("sampler", "camera_optimizer", "few_images") if is_open(getattr(config, name, 0))]
@@ -127,4 +127,4 @@ def test_rates_and_steps_of_dnerf_follow_its_canonical_field() -> None:
         found[canonical, variant] = tuple(getattr(decided, name) for name in names)
     assert found["network", "d-nerf"] == ("exponential", 0.1, 192, 1.0, 0.0, 0)  # the paper's
     assert found["hash-grid", "d-nerf"] == ("hold-exponential", 0.02, 384, 0.5, 0.5, 4)
-    assert found["hash-grid", "t-nerf"] == found["network", "d-nerf"]  # one network, whatever is said of the grid
+    assert found["hash-grid", "t-nerf"] == found["network", "d-nerf"]  # one network, for any grid

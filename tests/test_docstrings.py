@@ -34,13 +34,13 @@ docstring starts with a verb in the imperative, as in numpy's reference: "Return
 SECTIONS = ("Args", "Attributes", "Returns", "Yields", "Raises")
 """Google's sections. A heading has a line of its own, and the entries are indented below it."""
 EXTERNAL_BASES = {"nn.Module": nn.Module}
-"""Base classes from other packages whose methods are overridden here."""
+"""Base classes from other packages with methods that are overridden here."""
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 
 
 def problems(module: ast.Module, classes: dict[str, ast.ClassDef]) -> Iterator[str]:
-    """What the rules refuse in a module, a line each; `classes` are those of all modules by name."""
+    """Violations of the rules in a module, a line each; `classes` has the classes of all modules by name."""
     classes = classes | {node.name: node for node in module.body if isinstance(node, ast.ClassDef)}
     yield from _text_problems("the module", ast.get_docstring(module), is_function=False)
     for node in filter(_public, module.body):
@@ -94,7 +94,7 @@ def _definition_problems(name: str, node: Definition, classes: dict[str, ast.Cla
 
 
 def _arguments(node: Definition) -> tuple[list[str], set[str]]:
-    """Names of arguments, and what is described outside the docstring: fields below themselves, or in `__init__`."""
+    """Names of arguments, and those described outside the docstring: fields below themselves, or in `__init__`."""
     if not isinstance(node, ast.ClassDef):
         spec = node.args
         given = [*spec.posonlyargs, *spec.args, *spec.kwonlyargs, *filter(None, (spec.vararg, spec.kwarg))]
@@ -162,13 +162,13 @@ def _parsed(file: str) -> ast.Module:
 
 @cache
 def _classes() -> dict[str, ast.ClassDef]:
-    # Of two classes of one name, that of the room nearer to the root is the one that others derive from.
+    # If two classes have one name, others derive from the class in the room nearer to the root.
     files = sorted(FILES, key=lambda file: file.count("/"), reverse=True)
     return {node.name: node for file in files for node in _parsed(file).body if isinstance(node, ast.ClassDef)}
 
 
 def test_docstrings() -> None:
-    """Of all files at once: a test of its own for each takes longer than it does."""
+    """All files are checked at once: a test of its own for each would take longer."""
     found = {file: list(problems(_parsed(file), _classes())) for file in FILES}
     assert {file: lines for file, lines in found.items() if lines} == {}
 

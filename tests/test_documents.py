@@ -7,7 +7,7 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("docs", "examples", "framework", "tests", ".")
 DOCUMENTS = sorted(
     {file for folder in FOLDERS for file in (ROOT / folder).glob("*.md" if folder == "." else "**/*.md")}
-    - set(ROOT.glob("framework/templates/**/*.md"))  # their links are those of the package that is written
+    - set(ROOT.glob("framework/templates/**/*.md"))  # their links belong to the package that is written
 )
 LINK = re.compile(r"\[[^]]*]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Errors: one short printable line, whatever the names and values are that they speak of."""
+"""Errors: one short printable line, for all names and values in it."""
 
 import pickle
 

@@ -1,4 +1,4 @@
-"""Some of many, equally far apart: against whole-number arithmetic, also beyond what float32 can count."""
+"""Some of many, equally far apart: against whole-number arithmetic, also beyond the range that float32 can count."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def test_exposures_are_read_in_stops(tmp_path: Path) -> None:
 
 
 def test_what_is_missing_or_damaged_is_unknown(tmp_path: Path) -> None:
-    """And it is no error: pixels are what counts."""
+    """A missing exposure is no error: only pixels count."""
     files = [
         write(tmp_path / "none.jpg", None),
         write(tmp_path / "none.png", None),
@@ -143,7 +143,7 @@ def test_a_transforms_file_states_exposures(tmp_path: Path) -> None:
 
 
 def test_reduced_images_have_the_exposures_of_their_originals(tmp_path: Path) -> None:
-    """Whatever wrote the copies has left it out."""
+    """The program that wrote the copies has left it out."""
     folder = write_capture(tmp_path / "capture", 6)
     names = sorted(path.name for path in (folder / "images").iterdir())
     for index, name in enumerate(names):

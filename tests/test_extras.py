@@ -1,4 +1,4 @@
-"""What is said of optional packages holds: pip finds them by these names, from a clone too."""
+"""Messages about optional packages are right: pip finds them by these names, from a clone too."""
 
 import re
 from pathlib import Path

@@ -41,7 +41,7 @@ CAPTURES = pytest.mark.parametrize(("unit", "shift"), PLACES.values(), ids=PLACE
 
 
 def within(unit: float) -> float:
-    """A thousandth of the unit at most, which is a millimetre of a metre; and what float64 leaves of 5,000,000."""
+    """A thousandth of the unit at most, such as a millimetre of a metre, plus float64's rounding at 5,000,000."""
     return 1e-5 * unit + 1e-8
 
 
@@ -99,7 +99,7 @@ def test_a_scene_that_is_left_where_it_is_is_said_to_be_far(tmp_path: Path, caps
 
 
 def test_placements_that_were_rounded_to_float32_are_still_read(tmp_path: Path) -> None:
-    """Those of earlier runs, and nerfstudio's: cameras are where they say, and exports lead back to the input."""
+    """Placements of earlier runs, and nerfstudio's, put cameras in place, and exports lead back to the input."""
     run = run_on(tmp_path, 1.0, UTM)
     recorded = read_transforms(tmp_path / TRANSFORMS)
     rounded = {"transform": recorded.transform.float().tolist(), "scale": recorded.scale}
@@ -210,7 +210,7 @@ def test_meshes_are_read_back(
     assert offset_file(file).exists() == (kind == "glb" and shift.any())
     assert bool(said) == shift.any()
     if kind == "glb" and shift.any():
-        write_mesh(file, ball(unit, 0 * shift))  # whose offset is none, and which must not get that of before
+        write_mesh(file, ball(unit, 0 * shift))  # without an offset; it must not get the earlier one
         assert not offset_file(file).exists()
 
 

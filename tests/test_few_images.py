@@ -1,4 +1,4 @@
-"""Few images: when their regularisers are used, what a run says of it, and that they are the terms they should be."""
+"""Few images: when their regularisers are used, a run's report on them, and the values of their terms."""
 
 import dataclasses
 import re
@@ -81,7 +81,7 @@ def stepped(trainer: Trainer, steps: int = 3) -> dict[str, float]:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_term_is_there_where_it_is_asked_for(method: str, shared_tiny: Path, tmp_path: Path) -> None:
-    """What is near is the whole scene here, so that there is density in it."""
+    """The near part is the whole scene here, so that it has density."""
     asked = {"occlusion_loss_mult": 1.0, "occlusion_range": 3.0}
     assert stepped(tiny_trainer(method, shared_tiny, tmp_path / "with", **asked))["occlusion"] > 0
     assert "occlusion" not in stepped(tiny_trainer(method, shared_tiny, tmp_path / "without"))

@@ -1,6 +1,6 @@
-"""What runs on MPS uses no float64, which MPS has not, but through `exact`, which takes it to the processor.
+"""Operations on MPS use no float64, which MPS lacks, except through `exact`, which moves it to the CPU.
 
-There is no MPS here: each operation of a run is watched instead, on the processor.
+There is no MPS here: each operation of a run is watched instead, on the CPU.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from tests.training.helpers import TINY, tiny_trainer
 
 
 class Watched(TorchDispatchMode):
-    """Refuses operations that would make float64 on a device, or mix what `exact` took away with what stayed."""
+    """Refuses operations that would make float64 on a device, or mix tensors of `exact` with tensors that stayed."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         given = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
@@ -81,7 +81,7 @@ def test_exact_leaves_a_processors_values_where_they_are() -> None:
 
 @dataclasses.dataclass
 class Elsewhere:
-    """What stands on MPS, as far as `exact` asks."""
+    """A tensor on MPS, with the attributes that `exact` reads."""
 
     device: Any = dataclasses.field(default_factory=lambda: torch.device("mps"))
     asked: list[str] = dataclasses.field(default_factory=list)
@@ -97,7 +97,7 @@ class Elsewhere:
 
 @pytest.mark.parametrize("beta", [0.0, 0.9, 0.999])
 def test_adams_corrections_keep_their_digits_in_float32(beta: float) -> None:
-    """As float64 has them, for the first update and the millionth."""
+    """They equal float64's for the first update and the millionth."""
     counts = torch.tensor([0.0, 9.0, 999.0, 999_999.0])
     found = []
     for kind in (torch.float32, torch.float64):

@@ -13,7 +13,7 @@ from nerfloom.geometry.lenses import panorama
 
 
 def cameras(width: int = 400, height: int = 300, model: str = "pinhole", lens: torch.Tensor | None = None) -> Cameras:
-    """Two cameras whose principal point is not in the middle."""
+    """Two cameras with a principal point outside of the middle."""
     poses = torch.eye(4)[:3].repeat(2, 1, 1)
     numbers = (torch.full((2,), value) for value in (380.0, 390.0, 210.0, 140.0))
     return Cameras(poses, *numbers, torch.full((2,), width), torch.full((2,), height), model, lens)

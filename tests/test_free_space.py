@@ -28,7 +28,7 @@ def row(*places: float) -> Cameras:
 
 
 def test_two_cameras_side_by_side_see_together_from_a_distance() -> None:
-    """At depth z each sees [x - z, x + z], so at a gap of g another sees the share 1 - g / (2 z) of it."""
+    """Each sees [x - z, x + z] at depth z, so at a gap of g another sees the share 1 - g / (2 z) of it."""
     gap, near, far = 0.6, 0.05, 2.0
     found = distances_alone(row(0.0, gap), near, far)
     assert torch.equal(found[0], found[1])

@@ -1,4 +1,4 @@
-"""What users of nerfstudio type: answered with what is there, in a line, and nothing of theirs is run."""
+"""Commands of nerfstudio's users: the answer names the equivalent in a line, and nothing of theirs is run."""
 
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -90,7 +90,7 @@ def test_what_means_the_same_is_taken_and_said(
 
 
 def test_formats_and_their_flags_are_taken(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """In nerfstudio's order too: the format before --data."""
+    """nerfstudio's order is accepted too: the format before --data."""
     scaled = ["--pipeline.datamanager.dataparser.downscale-factor", "2"]
     run = run_of("nerfacto", ["blender-data", "--data", str(tiny), *scaled])
     assert (run.dataparser, getattr(run.parser, "downscale_factor")) == ("blender", 2)  # noqa: B009

@@ -1,4 +1,4 @@
-"""KiloNeRF: what it decides, what it learns of a teacher at points, and what happens to the teacher then."""
+"""KiloNeRF: its decisions, learning from a teacher at points, and the teacher afterwards."""
 
 import itertools
 import math
@@ -50,7 +50,7 @@ def test_the_grid_follows_the_box() -> None:
 
 
 def test_what_knows_the_direction_is_kept_small() -> None:
-    """Of all networks: at first the whole box is occupied, and a model of one network uses it."""
+    """All networks are small: at first the whole box is occupied, and a model of one network uses it."""
     model = pupil(view_dependence_mult=0.5, network_resolution=1)
     batch = make_source("pixels", ball_in_a_box(), model.config).draw(Request(0, 64))
     loss = model.train().loss(batch, 0)
@@ -103,7 +103,7 @@ def test_without_matter_points_are_anywhere() -> None:
 
 @pytest.mark.medium
 def test_a_pupil_learns_the_teachers_field(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In another frame than the teacher's, against the closed form."""
+    """The pupil has another frame than the teacher, and is compared with the closed form."""
     monkeypatch.setattr(distillation, "POINTS", 2048)
     model, own = pupil(), Placement.of(torch.tensor([[0.0, -1, 0, 0.1], [1, 0, 0, 0], [0, 0, 1, 0]]), 1.25)
     teacher = Teacher(marble(), own, IDENTITY)

@@ -252,7 +252,7 @@ def test_beyond_the_turning_point_there_is_no_ray() -> None:
 )
 @pytest.mark.parametrize("count", [1, 4])
 def test_compiled_rays_are_those_of_torch(model: str, lens: list[float] | None, count: int) -> None:
-    """Of lenses that do not reach the corners too."""
+    """Some lenses do not reach the corners."""
     camera = cameras(model, lens)
     if lens is not None:  # two lenses that differ
         camera = replace(camera, lens=torch.tensor([lens, [0.9 * value for value in lens]]))

@@ -1,4 +1,4 @@
-"""The plain installation stays light: every package that it brings is listed here, and what they weigh."""
+"""The plain installation stays light: every package that it brings is listed here, with sizes."""
 
 import ast
 import re
@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 TORCHS = {"torch", "filelock", "fsspec", "jinja2", "markupsafe", "mpmath", "networkx", "setuptools", "sympy"} | {
     "typing-extensions"
 }
-"""torch, and what it needs on a CPU; jinja2 is ours, too."""
+"""torch, and its requirements on a CPU; jinja2 is ours, too."""
 OURS = {
     "absl-py": "tensorboard",
     "docstring-parser": "tyro",
@@ -38,9 +38,9 @@ OURS = {
     "tyro": "the command line",
     "werkzeug": "tensorboard",
 }
-"""Package that comes without an extra, beside torch's -> what it is for, or which of the others needs it."""
+"""Package that comes without an extra, beside torch's -> its purpose, or the other package that needs it."""
 ONLY_SOMEWHERE = re.compile(r"nvidia-.+|cuda-.+|triton|importlib-.+|zipp|tomli|exceptiongroup|colorama")
-"""Packages that torch needs for CUDA, or that stand in for what an older Python or Windows lacks."""
+"""Packages that torch needs for CUDA, or that replace parts that an older Python or Windows lacks."""
 MAX_MEGABYTES = 310
 """Maximum size of the packages in `OURS`, installed, without compiled Python."""
 
@@ -69,7 +69,7 @@ def closure(wanted: list[Requirement]) -> set[str]:
             try:
                 needs = distribution(name).requires or []
             except PackageNotFoundError:
-                pytest.skip(f"{name} is not installed, so that what it needs is not known")
+                pytest.skip(f"{name} is not installed, so its requirements are not known")
             waiting += [(Requirement(line), option) for line in needs]
     return {name for name, _ in found}
 

@@ -22,7 +22,7 @@ def cube(count: int = 2001) -> torch.Tensor:
 
 @pytest.mark.parametrize("unit", [1e-4, 1.0, 1e5, 5e6])
 def test_the_unit_does_not_matter_but_the_distance_does(unit: float) -> None:
-    """Of points in a cube: the same answer in every unit, and another origin beyond some 130 edges of it."""
+    """Points in a cube get the same answer in every unit, and another origin beyond some 130 edges of it."""
     for away, is_far in ((0.0, False), (30.0, False), (100.0, False), (200.0, True), (1e6, True)):
         points = unit * (cube() + torch.tensor([away, -away / 2, 0.0]))
         origin = local_origin(points)

@@ -1,4 +1,4 @@
-"""Masks: what they ignore is neither drawn, nor judged, nor taken for empty."""
+"""Masks: ignored pixels are neither drawn, nor judged, nor taken for empty."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -129,7 +129,7 @@ def test_ignored_pixels_do_not_count_in_evaluation(shared_tiny: Path, tmp_path: 
     mask[: len(mask) // len(data)] = False  # of the first photograph nothing is left
     some = replace(data, kept=PixelSet.of_mask(mask))
     changed = some.pixels.clone()
-    changed[~mask] = 77  # whatever stands there
+    changed[~mask] = 77  # any value there
     found, same = evaluate(model, some), evaluate(model, replace(some, pixels=changed))
     assert [row["name"] for row in found.per_image] == list(data.names[1:])
     assert found.results["psnr"] == same.results["psnr"]
@@ -184,7 +184,7 @@ def test_what_is_ignored_is_not_taken_for_empty(shared_tiny: Path, tmp_path: Pat
 
 @pytest.mark.parametrize("channels", [3, 4])
 def test_masks_that_cut_out_are_alpha(tmp_path: Path, used: list[np.ndarray], channels: int) -> None:
-    """The same as images whose fourth channel holds the masks, in whole images and in batches."""
+    """They equal images with the masks as fourth channel, in whole images and in batches."""
     scene = write_noise(tmp_path / "images", SIZES, channels, ".png")
     masks = [write_mask(tmp_path / f"{index}.png", mask) for index, mask in enumerate(used)]
     scene = parsed(list(scene.image_paths), SIZES, [*masks, None])

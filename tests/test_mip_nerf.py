@@ -1,4 +1,4 @@
-"""mip-nerf and mip-nerf-360: what they are built of, what is decided, and what they minimise."""
+"""mip-nerf and mip-nerf-360: their parts, decisions and objectives."""
 
 import dataclasses
 from typing import Any

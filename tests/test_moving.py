@@ -53,7 +53,7 @@ def moving_trainer(name: str, data: Path, folder: Path, **changes: Any) -> Train
 
 
 def mean_squared_error(trainer: Trainer) -> float:
-    """Of the first camera's pictures at both times over white: fixed, unlike a batch's over random colours."""
+    """Error of the first camera's pictures at both times over white: fixed, unlike a batch's over random colours."""
     photographs, white = trainer.train_set, torch.ones(3)
     errors = []
     for index in (0, len(photographs) // 2):
@@ -74,7 +74,7 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
     found = []
     for time in (0.0, 1.0):
         image = trainer.model.render_view(dataclasses.replace(View.of(cameras, 0), time=time), white)
-        ball = image.accumulation > 0.5  # over white, what shines through changes neither difference
+        ball = image.accumulation > 0.5  # over white, light through the ball changes neither difference
         assert ball.float().mean() > 0.05
         found.append(image.rgb[ball].mean(0))
     assert found[0][0] - found[0][2] > 0.3
@@ -84,7 +84,7 @@ def test_colours_follow_time(name: str, shared_tiny: Path, tmp_path: Path) -> No
 @pytest.mark.medium
 @pytest.mark.parametrize("name", ["dnerf", "dnerf occupancy", pytest.param("dnerf hash", marks=pytest.mark.slow)])
 def test_what_is_deformed_learns_to_move(name: str, shared_tiny: Path, tmp_path: Path) -> None:
-    """What is only deformed keeps its colours, as in the paper: so a change of colour is learnt as displacement."""
+    """Deformed points keep their colours, as in the paper: so a change of colour is learnt as displacement."""
     trainer = moving_trainer(name, shared_tiny, tmp_path, max_num_iterations=60)
     field, positions = trainer.model.field, torch.rand(100, 3)
     small = field.deformation(positions, torch.ones(100))[0].abs().max()
@@ -121,7 +121,7 @@ def test_the_first_image_is_like_the_others() -> None:
 
 
 def times_decided(method: str, count: int, **settings: Any) -> dict[str, str]:
-    """What `method` decides about a scene whose images have `count` times, by the option's words."""
+    """Decisions of `method` for a scene with `count` times of images, by the option's words."""
     scene = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 4.0, count, True, True, 64, num_times=count)
     found = load_method(method)
     _, made = found.decided(dataclasses.replace(found.config, **settings), scene)

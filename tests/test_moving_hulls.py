@@ -1,4 +1,4 @@
-"""Silhouettes of what moves, at any speed: none of it is ever carved away, and most of the empty space is."""
+"""Silhouettes of moving bodies, at any speed: no matter is ever carved away, and most of the empty space is."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,7 +27,7 @@ SLICES, CELLS = 10, 32
 @pytest.mark.parametrize("speed", [0.25, 0.5, 1.5, 3.0, 6.0])
 @pytest.mark.parametrize("name", list(MOTIONS))
 def test_nothing_that_moves_is_carved_away_at_any_speed(name: str, speed: float) -> None:
-    """Beside it the speed that is found, and what is left of the box: for what is slow, nearly nothing."""
+    """The found speed and the remaining part of the box are right too: nearly nothing for slow motion."""
     check(MOTIONS[name], speed, 100, most_left={0.25: 0.04, 0.5: 0.06, 1.5: 0.2}.get(speed, 0.7))
 
 
@@ -37,7 +37,7 @@ def test_a_swinging_limb_is_not_carved_away() -> None:
 
 
 def check(moving: Callable[[float], Motion], speed: float, count: int, most_left: float) -> None:
-    """No matter of what moves is lost, and no more than `most_left` of the box is left, of `count` images."""
+    """No moving matter is lost, and at most `most_left` of the box is left, with `count` images."""
     dataset, times = photographed(moving(speed), count)
     silhouettes = Silhouettes.of(dataset)
     bound = motion_bound(silhouettes, BOX, times)
@@ -97,7 +97,7 @@ def test_of_too_few_images_no_speed_is_found_and_nothing_carved(count: int, tmp_
     run = tiny_run("kplanes", tmp_path, tmp_path, max_num_iterations=1, max_eval_images=0)
     trainer = Trainer.of(run, dataset)
     drawn = skip_by_silhouettes(trainer.config, trainer.model, trainer.train_set, fresh=True).drawn
-    assert drawn is None  # a pixel that is empty at its time teaches what is there at others
+    assert drawn is None  # a pixel that is empty at its time shows matter at others
     said, sampler = chosen(trainer), trainer.model.sampler
     reason = {decision.option: decision.reason for decision in trainer.profile.decisions}["silhouettes"]
     if count == 20:
@@ -129,7 +129,7 @@ def test_a_method_of_still_scenes_takes_the_speed_too() -> None:
 
 @pytest.mark.medium
 def test_the_grid_forgets_less_of_what_crosses_many_cells_of_a_slice() -> None:
-    """A limb at 6 box edges, whose density is known exactly; without more looks half as much again is skipped."""
+    """A limb moves at 6 box edges, with an exactly known density; without more looks half as much again is skipped."""
     motion, moments, found = swinging_limb(6.0), 2001, []
     hands = torch.tensor([motion(time)[0][1] for time in torch.linspace(0, 1, moments).tolist()])
     shoulder = torch.tensor([0.0, 0.0, 0.5])

@@ -1,4 +1,4 @@
-"""Multisamples of conical frustums against the frustums' moments, and what a contraction does to their size."""
+"""Multisamples of conical frustums against the frustums' moments, and the effect of a contraction on their size."""
 
 import math
 
@@ -45,7 +45,7 @@ def covariances(positions: Tensor) -> Tensor:
 @pytest.mark.parametrize("mirror", [1.0, -1.0])
 @pytest.mark.parametrize("angle", [0.0, math.pi / 6, 2.0])
 def test_mean_and_variances_are_the_frustums(radius: float, mirror: float, angle: float) -> None:
-    """Whatever the rotation: the mean, the variance along the axis, and the sum of those across it."""
+    """The mean, the variance along the axis, and the sum of the variances across it agree for every rotation."""
     cones = frustums(radius)
     mean_t, along, perpendicular = conical_frustums(cones.t_starts, cones.t_ends, cones.radii)
     positions, _ = multisamples(cones, turned(angle, mirror))
@@ -120,8 +120,8 @@ def test_in_evaluation_each_second_pattern_is_the_mirror_image_turned_by_30_degr
 
 @pytest.mark.parametrize("starts", ["anywhere", "along a ray", "far", "all the same"])
 def test_hashed_patterns_are_evenly_turned_and_half_of_them_mirrored(starts: str) -> None:
-    """Whatever the starts are: of rays that begin anywhere, of small steps from one place, far away, and of rays of
-    which only the ends of the first intervals differ."""
+    """This holds for all starts: of rays that begin anywhere, of small steps from one place, far away, and of rays that
+    differ only in the ends of the first intervals."""
     torch.manual_seed(0)
     t = {"anywhere": 2 + 4 * torch.rand(40_000), "along a ray": 2.1 + 1e-4 * torch.arange(40_000)}
     t["far"], t["all the same"] = 1e6 * t["anywhere"], torch.zeros(40_000)

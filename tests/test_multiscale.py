@@ -1,4 +1,4 @@
-"""Images at several sizes: what their pixels and cameras show, what they weigh, and what is reported of them."""
+"""Images at several sizes: their pixels and cameras, their weights, and their metrics."""
 
 import math
 from dataclasses import replace
@@ -47,7 +47,7 @@ def test_each_image_is_there_at_each_size(shared_tiny: Path) -> None:
 
 
 def test_small_images_are_means_of_premultiplied_pixels(shared_tiny: Path) -> None:
-    """To half a step of 8 bits in alpha, and in colour as far as alpha shows it."""
+    """Alpha agrees to half a step of 8 bits, and colour too where alpha shows it."""
     data = loaded(shared_tiny)
     for reduction in (2, 4, 8):
         for place, index in enumerate(images_of(data, reduction)):
@@ -61,7 +61,7 @@ def test_small_images_are_means_of_premultiplied_pixels(shared_tiny: Path) -> No
 
 
 def test_cameras_see_the_same_points_at_the_same_share_of_their_images(shared_tiny: Path) -> None:
-    """With pixel centres at 0.5: a point's column c + 0.5 is halved with the size."""
+    """Pixel centres are at 0.5: a point's column c + 0.5 is halved with the size."""
     data = loaded(shared_tiny)
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     for reduction in (2, 4, 8):
@@ -72,7 +72,7 @@ def test_cameras_see_the_same_points_at_the_same_share_of_their_images(shared_ti
 
 
 def test_cones_are_as_wide_as_pixels(shared_tiny: Path) -> None:
-    """Mip-NeRF's radius in the middle of an image, 2 / sqrt(12) of a pixel at distance 1, whose edges are looked at."""
+    """Mip-NeRF's radius in the middle of an image, 2 / sqrt(12) of a pixel at distance 1, against its edges."""
     data = loaded(shared_tiny)
     for reduction in (1, 2, 4, 8):
         index = images_of(data, reduction)[0]

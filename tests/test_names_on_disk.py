@@ -1,4 +1,4 @@
-"""Names in a data set and on the disk: what is taken for what, what is said, and what is never taken."""
+"""Names in a data set and on the disk: accepted replacements, messages, and refused files."""
 
 import unicodedata
 from pathlib import Path
@@ -85,7 +85,7 @@ def test_nothing_is_taken_where_two_come_into_question(tmp_path: Path, names: li
 
 
 def test_a_missing_image_is_not_replaced_by_one_of_another_folder(tmp_path: Path) -> None:
-    """Of left/2.jpg only the right eye's image is there, which has another pose."""
+    """For left/2.jpg only the right eye's image exists, which has another pose."""
     make(tmp_path, "left/1.jpg", "right/1.jpg", "right/2.jpg")
     found = match_names(tmp_path, ["left/1.jpg", "left/2.jpg"]).files
     assert found == {"left/1.jpg": "left/1.jpg"}

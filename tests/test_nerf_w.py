@@ -1,4 +1,4 @@
-"""NeRF-W: its loss, compositing of two parts, what held-out views show, and where transient vectors are."""
+"""NeRF-W: its loss, compositing of two parts, held-out views, and the positions of transient vectors."""
 
 import dataclasses
 
@@ -88,7 +88,7 @@ def two_parts() -> tuple[Rays, Samples, Slabs, Given]:
 
 
 def test_two_parts_are_composited_as_many_thin_slices() -> None:
-    """Reference: 20,000 slices of each interval, whose light is that of equation 8; and equation 11."""
+    """Reference: 20,000 slices of each interval, with the light of equation 8; and equation 11."""
     rays, samples, field, head = two_parts()
     background = torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
     found = TransientRenderer(head, LEAST, None).render(rays, samples, field, background)
@@ -148,7 +148,7 @@ def test_before_training_the_transient_part_is_nearly_transparent() -> None:
 
 @pytest.mark.parametrize("resolution", [1, 2, 5])
 def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
-    """Each image's vectors are linear over it, so that what is looked up is that function of the pixel's place."""
+    """Each image's vectors are linear over it, so a look-up gives this function of the pixel's place."""
     cameras = cameras_at(torch.tensor([[4.0, 0, 1], [0.0, 4, 1], [-3.0, 1, 2]]), 40, 9)
     head = TransientHead(16, 3, resolution, 8, BOX, cameras.camera_to_worlds, 0.1)
     head.reach.fill_(float((cameras.widths / cameras.fx).max()) / 2)

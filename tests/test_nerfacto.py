@@ -1,4 +1,4 @@
-"""Nerfacto: what the scene decides, and that each part does what it says."""
+"""Nerfacto: decisions from the scene, and the effect of each part."""
 
 import dataclasses
 from functools import partial
@@ -19,7 +19,7 @@ from tests.training.helpers import chosen, said_otherwise, tiny_run, tiny_traine
 
 SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 1.0, 6.0, 4, True, False, 32)
 captured = partial(said_otherwise, "nerfacto")
-"""A trainer on the tiny data set, of whose scene other things are said."""
+"""A trainer on the tiny data set with other facts of its scene."""
 
 
 def test_a_bounded_scene_with_exact_poses_needs_little(shared_tiny: Path, tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_in_a_share_of_the_steps_an_image_has_the_mean_appearance() -> None:
 
 
 def dimmed(folder: Path, out: Path, factors: torch.Tensor, **settings: object) -> Trainer:
-    """Return a trained nerfacto of the tiny data set, whose photographs are darker by factors (M,)."""
+    """Return a trained nerfacto of the tiny data set with photographs darkened by factors (M,)."""
     still = tiny_trainer("nerfacto", folder, out / "still").train_set
     sizes, pixels = still.cameras.widths * still.cameras.heights, still.pixels.clone()
     pixels[:, :3] = (still.pixels[:, :3] * factors.repeat_interleave(sizes)[:, None]).round().to(torch.uint8)
@@ -173,9 +173,9 @@ def test_half_of_a_held_out_photograph_tells_the_others_appearance(shared_tiny: 
 def test_the_mean_appearance_is_what_photographs_have_in_common(
     tiny: Path, edit_json: EditJson, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each photograph is there twice, once as it is and once five times darker: what is between them is shown.
+    """Each photograph is there twice, once as it is and once five times darker: pictures show the light between them.
 
-    And the fit of an appearance starts from that of a photograph in the same light.
+    The fit of an appearance starts from the appearance of a photograph in the same light.
     """
     edit_json(lambda content: content.update(frames=2 * content["frames"]))
     factors, off = torch.tensor([1.0, 0.2]).repeat_interleave(10), {}
@@ -201,7 +201,7 @@ def test_the_mean_appearance_is_what_photographs_have_in_common(
 
 @pytest.mark.medium
 def test_normals_are_learnt_and_shown(shared_tiny: Path, tmp_path: Path) -> None:
-    """Of the ball, whose colours are its normals: pictures of the two agree."""
+    """The ball has its normals as colours: pictures of the two agree."""
     trainer = captured(shared_tiny, tmp_path, {}, predict_normals=True, max_num_iterations=90)
     trainer.train()
     assert {"normals", "orientation"} <= trainer.train_step().losses.keys()

@@ -1,4 +1,4 @@
-"""The notebooks run from their first cell to their last, and show what they say."""
+"""The notebooks run from their first cell to their last, with the described results."""
 
 import ast
 import json
@@ -41,7 +41,7 @@ def code_of(name: str) -> list[str]:
 
 @pytest.fixture
 def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
-    """What a notebook has given names to: those of `__main__`. Scenes and methods are small, and trainings short."""
+    """The names of a notebook, which are `__main__`'s. Scenes and methods are small, and trainings short."""
     train = nerfloom.train
     scene = partial(registry.load_dataparser("procedural"), size=SIZE, num_train=12)
     small = {"max_num_iterations": 60, "vis": "none"}
@@ -90,7 +90,7 @@ def test_loading_and_looking_takes_six_lines_at_most() -> None:
 
 @pytest.mark.medium
 def test_a_pose_is_rendered_from_where_it_is(names: dict[str, Any]) -> None:
-    """The point is where the pixel's ray ends; and a view's own camera shows what the view does."""
+    """The point is where the pixel's ray ends; and a view's own camera gives the view."""
     folder, box, view, point, turn = (shown(source, names) for source in code_of("render-from-a-pose"))
     assert (folder / "config.yml").is_file()
     assert box.shape == (2, 3)
@@ -117,7 +117,7 @@ def test_methods_are_compared_by_the_same_images(names: dict[str, Any], capsys: 
         assert float(psnr) == pytest.approx(names["runs"][method].evaluate(max_images=4)["psnr"], abs=0.006)
     assert strip.size == (4 * SIZE, SIZE)
     parts = np.asarray(strip).reshape(SIZE, 4, SIZE, 3).swapaxes(0, 1).astype(float)
-    for part, method in zip(parts[1:], names["METHODS"], strict=True):  # what each shows is nearer than white is
+    for part, method in zip(parts[1:], names["METHODS"], strict=True):  # each is nearer than white
         found = np.square(part - parts[0]).mean()
         assert found < np.square(255 - parts[0]).mean(), method
     assert 0 < mean < worst <= 1

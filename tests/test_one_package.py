@@ -1,4 +1,4 @@
-"""Everything is imported as nerfloom, whatever lies in the working folder."""
+"""Everything is imported as nerfloom, with any files in the working folder."""
 
 import subprocess
 import sys
@@ -29,7 +29,7 @@ def shadowed(tmp_path: Path) -> Path:
 
 
 def output_of(words: list[str], folder: Path) -> str:
-    """What a program prints that is started in a folder and must succeed."""
+    """Output of a program that is started in a folder and must succeed."""
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -71,7 +71,7 @@ def test_no_command_imports_anything_of_the_working_folder(shadowed: Path) -> No
 
 @pytest.mark.medium
 def test_a_child_imports_no_name_of_the_working_folder(shadowed: Path) -> None:
-    """Not even those of other packages, from Python 3.11 on."""
+    """It does not import names of other packages either, from Python 3.11 on."""
     if SAFE:
         for name in ("tyro", "runpy", "nerfloom"):
             (shadowed / f"{name}.py").write_text(SHADOW)

@@ -1,4 +1,4 @@
-"""Python writes what the commands write, to the byte, and its namespace is its interface."""
+"""Python and the commands write the same bytes, and the namespace is the interface."""
 
 import dataclasses
 import json
@@ -49,7 +49,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """What files of a folder hold, by their names."""
+    """Content of the files of a folder, by name."""
     return {file.relative_to(folder).as_posix(): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
@@ -219,7 +219,7 @@ def test_a_file_stands_as_it_is_told_and_a_run_is_of_the_chosen_checkpoint(ball:
 
 
 def test_a_camera_is_made_by_hand_and_rendered(ball: Path) -> None:
-    """From x = 4 of the input, the ball of radius 1 is in the middle, as large as its tangents."""
+    """Seen from x = 4 of the input, the ball of radius 1 is in the middle, with the size given by its tangents."""
     opened = nerfloom.load(ball)
     middle = torch.zeros(3)
     pose = nerfloom.look_at(opened.placement.points(torch.tensor([[4.0, 0, 0]]))[0].float(), middle)

@@ -237,7 +237,7 @@ def test_a_run_learns_is_loaded_and_renders_unseen_scenes(tmp_path: Path) -> Non
 @pytest.mark.medium
 @pytest.mark.usefixtures("registered")
 def test_learnt_weights_render_other_data(tmp_path: Path, shared_tiny: Path) -> None:
-    """A checkpoint of many scenes fits data of one, whose training images are then what is rendered from."""
+    """A checkpoint of many scenes fits data of one; its training images are then the source views."""
     trainer, _ = trained_on_many(tmp_path / "many", Procedural(size=16, num_scenes=2, views_per_scene=6), SMALL)
     trainer.train_step()
     one = tiny_trainer(

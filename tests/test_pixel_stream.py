@@ -20,7 +20,7 @@ from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 SEED = 7
 STEPS = 30
-"""Of the runs."""
+"""Number of steps of the runs."""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def assert_same(one: PixelBatch, two: PixelBatch) -> None:
 
 
 def test_batches_are_those_from_memory_whatever_their_sizes(both: tuple[Dataset, Dataset]) -> None:
-    """Growing, shrinking, larger than what was read, and not in order."""
+    """Batches grow, shrink, are larger than the block read ahead, and come out of order."""
     here, there = both
     stream = PixelStream(there, SEED)
     sizes = [100, 100, 101, 400, 399, 3, 2, 1, 5000, 50, *range(60, 160, 2)]
@@ -101,7 +101,7 @@ def test_pixels_are_even_and_independent_within_and_between_batches(both: tuple[
 
 
 def test_what_a_step_draws_first_does_not_depend_on_how_many_it_draws(both: tuple[Dataset, Dataset]) -> None:
-    """What reading ahead rests on: torch's generator on the processor fills in order."""
+    """Reading ahead depends on this: torch's generator on the CPU fills in order."""
     for total in (1000, 5 * 10**9):
         few, many = (torch.randint(total, (n,), generator=torch.Generator().manual_seed(3)) for n in (1000, 70_001))
         torch.manual_seed(3)
@@ -125,7 +125,7 @@ def test_a_run_from_a_file_is_the_run_from_memory(shared_tiny: Path, tmp_path: P
 
 @pytest.fixture(scope="module")
 def uninterrupted(shared_tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, torch.Tensor]:
-    """What a run from a file has learnt."""
+    """Parameters of a run from a file."""
     folder = tmp_path_factory.mktemp("uninterrupted")
     settings = {"max_num_iterations": STEPS, "cache_dir": folder / "cache", "cache_limit": 0.0}
     whole = tiny_trainer("instant-ngp", shared_tiny, folder / "whole", **settings)

@@ -57,7 +57,7 @@ def test_more_time_moves_a_setting_one_way_and_not_more_than_as_many_times(size:
         for name, value in vars(less).items():
             smaller, larger = (value, getattr(more, name)) if name in GROW else (getattr(more, name), value)
             assert smaller <= larger, (before, after, name)
-        # Sizes of tables and cells a pixel have whole steps; what has not follows the time, but for rounding.
+        # Sizes of tables and cells per pixel have whole steps; other numbers follow the time, except for rounding.
         assert more.num_steps <= less.num_steps * after / before + 32
         assert more.samples <= less.samples * after / before + 1024
         assert more.log2_table_size <= less.log2_table_size + 1

@@ -1,4 +1,4 @@
-"""PLY files: every kind of number, whatever comes with it; and no trust in what a header claims."""
+"""PLY files: every kind of number, with any other content; and no trust in a header's claims."""
 
 import struct
 from pathlib import Path
@@ -86,7 +86,7 @@ def test_no_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("normals", [None, torch.tensor([[0.0, 0.6, -0.8], [1.0, 0.0, 0.0]])])
 def test_written_numbers_stand_under_their_own_names(tmp_path: Path, normals: torch.Tensor | None) -> None:
-    """By the format's definition: a line of the header for each property, in the order of the numbers."""
+    """The format's definition has a line of the header for each property, in the order of the numbers."""
     colors = torch.tensor([[1.0, 0.5, 0.0], [-0.1, 0.2, 1.3]])
     file = tmp_path / "points.ply"
     write_points(file, EXPECTED.float(), colors, normals)

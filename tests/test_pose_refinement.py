@@ -129,7 +129,7 @@ def test_without_refinement_other_cameras_stay_though_all_are_in_one_place() -> 
 
 
 def test_held_out_cameras_follow_those_around_them_where_poses_drift_along_the_way() -> None:
-    """Errors that grow along a path, with noise of a single camera: what lies between cameras follows the path's."""
+    """Errors that grow along a path, with noise of a single camera: cameras between them follow the path's."""
     torch.manual_seed(0)
     along = torch.linspace(0, 1, 41)
     angles = 0.1 * along.square()  # about z, and a shift along x

@@ -1,4 +1,4 @@
-"""What a module can is told from what it registers, on every Python."""
+"""A module's protocols are recognised from its registered attributes, on every Python."""
 
 import importlib
 import inspect
@@ -29,7 +29,7 @@ class WithAppearance(nn.Module):
 
 
 def members(kind: Any) -> set[str]:
-    """What Python 3.12 and newer look for, as they name it."""
+    """The members that Python 3.12 and newer look for."""
     annotated = {name for base in kind.__mro__ for name in inspect.get_annotations(base)}
     return annotated | {name for name, value in vars(kind).items() if callable(value) and not name.startswith("_")}
 

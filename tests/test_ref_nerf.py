@@ -1,4 +1,4 @@
-"""Ref-NeRF: light by hand, normals of densities by differences, what training teaches, and its pictures."""
+"""Ref-NeRF: light by hand, normals of densities by differences, results of training, and its pictures."""
 
 import dataclasses
 import math
@@ -50,7 +50,7 @@ def places(count: int = 40) -> Tensor:
 
 
 class Probe(nn.Module):
-    """Keeps what the directional network is given."""
+    """Keeps the inputs of the directional network."""
 
     def forward(self, *parts: Tensor) -> Tensor:
         self.given = parts
@@ -124,7 +124,7 @@ def test_normals_point_down_the_density(kind: str, unbounded: bool) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_penalties_of_normals_train_the_density(kind: str) -> None:
-    """As in the paper: without any other term, the spatial network and the encoding get a gradient."""
+    """Without any other term, the spatial network and the encoding get a gradient, as in the paper."""
     trainer = trainer_of(kind, sparse_updates=False)
     model, batch = trainer.model, trainer.source.draw(Request(0, 64))
     model.train()
@@ -141,7 +141,7 @@ def test_penalties_of_normals_train_the_density(kind: str) -> None:
 
 
 def test_sums_over_drawn_samples_are_those_over_all() -> None:
-    """On average; no sample without weight is drawn, and one that outweighs all others is drawn always."""
+    """They agree on average; no sample without weight is drawn, and one that outweighs all others is always drawn."""
     torch.manual_seed(0)
     weights = torch.rand(1000) ** 8
     weights[:100], weights[-1] = 0, 30.0
@@ -179,7 +179,7 @@ def mirror(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_training_on_a_mirror(kind: str, steps: int, own: dict[str, object], mirror: Path, tmp_path: Path) -> None:
     """The loss falls, pictures have all outputs, and normals are judged against the true ones.
 
-    Without the penalty on normals that face away, those of a grid would be off by 92 degrees.
+    Without the penalty on normals that face away, a grid's normals would be off by 92 degrees.
     """
     train, test = (load_dataset(Blender().parse(mirror, s), s) for s in ("train", "test"))
     trainer = trainer_of(kind, train, max_num_iterations=steps, **own)

@@ -1,4 +1,4 @@
-"""Names of methods and formats: lazy, and honest about what is broken."""
+"""Names of methods and formats: they are loaded lazily, and broken ones are reported."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -58,7 +58,7 @@ def test_unknown_names_get_the_nearest() -> None:
 
 @pytest.fixture
 def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., Path]]:
-    """Write modules into a folder of the path, and register what the variables say."""
+    """Write modules into a folder of the path, and register the names of the variables."""
 
     def register(modules: dict[str, str] | None = None, **variables: str) -> Path:
         for name, text in (modules or {}).items():
@@ -138,7 +138,7 @@ def test_what_the_environment_names_cannot_hide_what_is_installed(environment: C
 
 
 def install(folder: Path, package: str, methods: str) -> None:
-    """What an installed package leaves of its entry points."""
+    """Metadata of an installed package with its entry points."""
     metadata = folder / f"{package.replace('-', '_')}-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")

@@ -67,8 +67,8 @@ def test_neighbours_of_a_tile_are_in_its_image(side: int) -> None:
 
 
 def learnt(count: int, steps: int, person: float, noise: float) -> tuple[ContradictedTiles, torch.Tensor]:
-    """Tiles after random draws with errors of any sign, and a person in a corner of the first image, whose errors have
-    one sign. Returns the tiles and the pixels (P,) bool of the person."""
+    """Tiles after random draws with errors of any sign, and a person in a corner of the first image, with errors of one
+    sign. Returns the tiles and the pixels (P,) bool of the person."""
     torch.manual_seed(count)
     tiles, cameras = ContradictedTiles(BALL.train, 4.0), BALL.train.cameras
     total, width = int(cameras.offsets[-1]), int(cameras.widths[0])
@@ -101,7 +101,7 @@ def test_hardly_a_tile_is_left_out_where_nothing_moves(count: int) -> None:
 
 
 def test_means_forget_as_stated_and_pass_over_what_is_not_finite() -> None:
-    """In float64, with one pixel a step."""
+    """The truth is in float64, with one pixel a step."""
     tiles = ContradictedTiles(BALL.train, 4.0)
     sums, weight, kept = np.zeros(3), 0.0, np.exp(-1 / MEMORY)
     for step in range(100):
@@ -129,7 +129,7 @@ def test_all_pixels_count_at_first_and_without_draws() -> None:
 
 
 def contradicting(dataset: Dataset = BALL.train) -> tuple[BatchSource, torch.Tensor]:
-    """A source with --robust whose first tiles are contradicted, and which (P,) bool of all pixels are in them."""
+    """A source with --robust and contradicted first tiles, and (P,) bool, whether a pixel is in them."""
     config = dataclasses.replace(load_method("instant-ngp").config, robust="errors")
     source = make_source("pixels", dataset, config)
     assert source.contradicted is not None

@@ -1,4 +1,4 @@
-"""The scale of a run: its file, its effect on placements, on all that is exported, and on what is read again."""
+"""The scale of a run: its file, its effect on placements, on all exports, and on files read again."""
 
 import json
 from pathlib import Path
@@ -108,7 +108,7 @@ def test_a_true_length_scales_all_that_is_exported(run: Path, tmp_path: Path) ->
 
 @pytest.mark.medium
 def test_points_are_given_in_a_photograph(run: Path) -> None:
-    """Of the ball of radius 1 at the origin."""
+    """The points are on the ball of radius 1 at the origin."""
     name = f"train/{load(run).dataset('train').names[0]}"
     done = called("ns-measure", run, "--between", "9.5,7", "9.5,12", "--image", name)
     assert done.returncode == 0, done.stderr

@@ -71,7 +71,7 @@ def test_every_pixel_that_could_see_the_hull_is_kept(ball: Dataset) -> None:
 
 
 def test_an_object_that_leaves_the_frame_is_not_cut_off(ball: Dataset) -> None:
-    """Zoomed in until the ball fills every photograph: what no photograph shows whole stays."""
+    """The photographs are zoomed in until the ball fills them: an object that none shows whole stays."""
     cameras = replace(ball.cameras, fx=ball.cameras.fx * 3, fy=ball.cameras.fy * 3)
     pixels = ball.pixels.clone()
     pixels[:, 3] = 255
@@ -121,7 +121,7 @@ def test_of_a_moving_scene_what_all_photographs_show_empty_goes(ball: Dataset) -
 
 
 def disc(cameras: Cameras, image: int, center: torch.Tensor, radius: float) -> torch.Tensor:
-    """The pixels (H, W) bool whose ray meets a ball, by the distance between its centre and the ray."""
+    """The pixels (H, W) bool with a ray that meets a ball, by the distance between its centre and the ray."""
     rays = cameras.pixel_rays(cameras.image_pixels(image), 0.1, 20)
     apart = (center - rays.origins).cross(rays.directions, dim=-1).norm(dim=-1)
     return (apart < radius).view(int(cameras.heights[image]), int(cameras.widths[image]))
@@ -139,7 +139,7 @@ def flight(
 
 
 RADIUS = 0.25
-"""Of the ball that flies."""
+"""Radius of the flying ball."""
 
 
 def place(time: float) -> torch.Tensor:
@@ -161,7 +161,7 @@ def flying(ball: Dataset) -> tuple[Silhouettes, torch.Tensor, MotionBound]:
 def test_a_flying_ball_is_never_outside_the_hull_of_its_time(
     flying: tuple[Silhouettes, torch.Tensor, MotionBound], slices: int
 ) -> None:
-    """At all times, those between two images too; and what the hull leaves grows less with the number of slices."""
+    """This holds at all times, also between two images; and the hull shrinks with the number of slices."""
     silhouettes, times, bound = flying
     hull = moving_hulls(silhouettes, BOX, 16, times, bound, slices).view(slices, -1)
     cells = centers(16)
@@ -207,5 +207,5 @@ def test_closed_frames_show_the_same_and_nothing_around(ball: Dataset) -> None:
         held = [torch.ones(500, dtype=torch.bool) for _ in range(2)]
         for closed, found in zip((False, True), held, strict=True):
             hold_balls(replace(silhouettes, closed=closed).photograph(image), points, 0.05, found, every=True)
-        assert bool((held[0] | ~held[1]).all())  # what was empty stays so
+        assert bool((held[0] | ~held[1]).all())  # empty cells stay empty
         assert held[1].float().mean() < held[0].float().mean()

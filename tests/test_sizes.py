@@ -1,4 +1,4 @@
-"""Settings beyond measure: each number of each method makes a model, or one line that says what it may be."""
+"""Settings beyond measure: each number of each method makes a model, or one line with the allowed range."""
 
 import dataclasses
 import math
@@ -39,7 +39,7 @@ WRONG: dict[type, tuple[float, ...]] = {int: (0, -1, *HUGE), float: (0.0, -1.0, 
 
 
 def numbers(config: TrainConfig) -> Iterator[tuple[str, Any]]:
-    """Each numeric setting's name, and values that nobody means; what all methods share, for one of them."""
+    """Each numeric setting's name, and values that nobody means; shared settings are tested for one method."""
     shared = {f.name for f in dataclasses.fields(TrainConfig)} if type(config) is not SHARED_BY else set()
     for name, hint in typing.get_type_hints(type(config)).items():
         if name in shared:

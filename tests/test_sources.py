@@ -1,4 +1,4 @@
-"""Where batches come from: whole images, and what a source carries over to a changed data set."""
+"""Sources of batches: whole images, and the state that a source carries over to a changed data set."""
 
 from dataclasses import replace
 

@@ -41,7 +41,7 @@ def cameras(model: str, count: int = 2) -> Cameras:
 
 @pytest.mark.parametrize("model", LENSES)
 def test_a_point_is_where_its_pixels_ray_ends(model: str) -> None:
-    """Within half a pixel's width at that distance, whatever the lens."""
+    """The error is below half a pixel's width at that distance, for every lens."""
     torch.manual_seed(0)
     points = torch.cat([torch.rand(200, 2) * 2 - 1, -1 - 4 * torch.rand(200, 1)], dim=-1)
     seen_by = cameras(model)
@@ -184,7 +184,7 @@ def test_keypoints_stand_last_in_a_batch_with_their_distances(dataset: Dataset) 
 
 
 def test_a_batch_without_keypoints_is_as_it_was(dataset: Dataset) -> None:
-    """Also that the pixels drawn evenly do not depend on what is drawn besides."""
+    """The pixels drawn evenly do not depend on other draws either."""
     batches = []
     for data, keypoints in ((dataclasses.replace(dataset, sparse_depth=None), 0), (dataset, 0), (dataset, 14)):
         seed_step(3, 7)
@@ -238,7 +238,7 @@ def test_points_teach_in_the_first_half_alone(dataset: Dataset, shared_tiny: Pat
 def test_points_teach_where_the_surface_is_and_that_space_before_it_is_empty(
     parsed, dataset: Dataset, shared_tiny: Path, tmp_path: Path
 ) -> None:
-    """With white pictures only points can tell; without them nothing does."""
+    """White pictures have no information, so only points teach the surface; without points nothing does."""
     blind = dataclasses.replace(dataset, pixels=torch.full_like(dataset.pixels, 255))
     found = []
     for mult in (0.0, 0.05):

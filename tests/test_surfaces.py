@@ -1,4 +1,4 @@
-"""Methods with a signed distance: how they start, what they learn of a ball, and its mesh."""
+"""Methods with a signed distance: their start, training on a ball, and its mesh."""
 
 import dataclasses
 import math
@@ -69,7 +69,7 @@ def places(count: int = 500) -> Tensor:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_training_starts_as_a_ball(name: str) -> None:
-    """Of a quarter of the box's size, up to the noise of the first weights; its gradient has length 1."""
+    """The ball has a quarter of the box's size, up to the noise of the first weights; its gradient has length 1."""
     field = trainer_of(name).model.field
     assert isinstance(field, SurfaceField)
     shape = field.shape(places())
@@ -104,7 +104,7 @@ def test_gradients_are_those_of_the_distance(opened: float) -> None:
 
 @pytest.mark.parametrize("opened", [4.0, 2.5])
 def test_distances_alone_are_those_with_gradients(opened: float) -> None:
-    """With all levels of the grid and with some of them open; the papers' network has no form for compiled calls."""
+    """All levels of the grid are open, or some of them; the papers' network has no form for compiled calls."""
     field = trainer_of("neus").model.field
     assert isinstance(field, SurfaceField)
     grid = grid_of(field)
@@ -353,7 +353,7 @@ def test_a_floor_of_a_capture_belongs_to_the_first_shape(seen: bool, shared_tiny
 
 
 def test_the_inverse_width_stays_between_bounds() -> None:
-    """At first it cannot leave its first value; halfway to the end of the bound it may be some 7 times as large."""
+    """It cannot leave its first value at first; halfway to the end of the bound it may be some 7 times as large."""
     trainer = trainer_of("neus", sharpen_until=0.8)
     sharpness = trainer.model.field.sharpness
     for progress, upper in ((0.0, 20.0), (0.4, 20 * 50**0.5), (0.9, 1e4)):
@@ -394,7 +394,7 @@ def test_normals_of_a_ball_change_with_its_curvature() -> None:
 
 
 def exact_ball() -> tuple[Trainer, SurfaceField]:
-    """A trainer whose field is a ball of radius 0.5 without noise."""
+    """A trainer with a ball of radius 0.5 without noise as field."""
     trainer = trainer_of("neus", start_radius=0.5)
     field = trainer.model.field
     assert isinstance(field, SurfaceField)
@@ -408,7 +408,7 @@ def shown_by(trainer: Trainer, batch: PixelBatch) -> RenderedBatch:
 
 
 def test_the_curvature_term_is_that_of_level_sets() -> None:
-    """At samples of a field that is a ball, the mean over the samples that the term asks."""
+    """The truth is the mean over the samples of the term, for a field that is a ball."""
     trainer, field = exact_ball()
     shown = shown_by(trainer, draw_batch(trainer.train_set, 64, "white"))
     samples = shown.rendered.samples
@@ -461,7 +461,7 @@ def points_on_axes(radius: float) -> PixelBatch:
 
 
 def test_points_of_a_reconstruction_pull_the_surface() -> None:
-    """Terms of a ball of radius 0.5: 0 for points on it; for others, what can be computed by hand."""
+    """Terms of a ball of radius 0.5: 0 for points on it, and computed by hand for others."""
     trainer, field = exact_ball()
     with torch.no_grad():
         right = shown_by(trainer, points_on_axes(0.5))

@@ -1,4 +1,4 @@
-"""Losses that are learnt in one call, and those that are not."""
+"""Losses that are computed in one call, and losses that are not."""
 
 import dataclasses
 from pathlib import Path
@@ -22,7 +22,7 @@ def losses(trainer: Trainer, steps: int = 4) -> list[float]:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[TracedError | None]:
-    """What was learnt in one call, or None where a part does not fit, of each step that asked for it."""
+    """The result of one call, or None if a part does not fit, for each step that asked for it."""
     found, usual = [], ray_model.error_of_traced
     monkeypatch.setattr(ray_model, "error_of_traced", lambda *a: found.append(usual(*a)) or found[-1])
     return found
@@ -62,7 +62,7 @@ def test_steps_are_those_of_single_operations(
 def test_other_losses_and_fields_are_not_left_out(
     shared_tiny: Path, tmp_path: Path, settings: dict[str, object], calls: list[TracedError | None]
 ) -> None:
-    """What the one call does not know is computed by single operations."""
+    """Single operations compute terms that the one call does not know."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "b", **settings)
     known = "depth_loss_mult" in settings  # without known distances there is no such loss
     assert traced(trainer, calls) == known
@@ -107,7 +107,7 @@ class Smallness(LossTerm):
 def test_a_class_of_ones_own_says_that_its_colours_are_the_usual_ones(
     shared_tiny: Path, tmp_path: Path, calls: list[TracedError | None]
 ) -> None:
-    """What it does not say is not taken from the class that it derives from."""
+    """A missing declaration is not inherited from the base class."""
     trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path, sampler="occupancy", samples_per_batch=4096)
     model, kind = trainer.model, type(trainer.model)
     assert traced(trainer, calls)

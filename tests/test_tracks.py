@@ -15,7 +15,7 @@ SOUND = torch.zeros(1, dtype=torch.int64)
 
 
 def two_rays(angle: float, distance: float, error: float) -> tuple[Tracks, torch.Tensor]:
-    """A point at the origin, seen from two cameras at the same distance, whose rays are `angle` apart."""
+    """A point at the origin, seen from two cameras at the same distance, with rays `angle` apart."""
     half = angle / 2
     centers = distance * torch.tensor([[math.sin(half), 0.0, math.cos(half)], [-math.sin(half), 0.0, math.cos(half)]])
     return Tracks(
@@ -77,7 +77,7 @@ def test_one_image_knows_no_distance() -> None:
 
 
 def test_rays_that_hardly_differ_know_no_distance() -> None:
-    """At an angle of 20 errors the deviation is 7 %, at 5 it is 28 %."""
+    """The deviation is 7 % at an angle of 20 errors, and 28 % at 5."""
     for ratio, count in ((20, 2), (5, 0)):
         tracks, centers = two_rays(ratio * 1e-3, 3.0, 1e-3)
         deviations = distance_deviations(tracks, centers) / 3
@@ -99,7 +99,7 @@ def test_images_are_numbered_anew_in_the_order_given() -> None:
 
 
 def test_images_keep_the_points_that_they_see(tmp_path: Path) -> None:
-    """Of five images, image i sees points i and i + 1, and the last one sees none. Point 9 has no track."""
+    """There are five images: image i sees points i and i + 1, and the last one sees none. Point 9 has no track."""
     sees = [(image, point) for image in range(4) for point in (image, image + 1)]
     points = torch.arange(10.0)[:, None].expand(10, 3)
     observations = Observations(*torch.tensor(sees).unbind(-1)).of_points(torch.ones(10, dtype=torch.bool))
@@ -113,7 +113,7 @@ def test_images_keep_the_points_that_they_see(tmp_path: Path) -> None:
     assert one.points[:, 0].tolist() == [3, 4, 9]
     assert replace(scene, observations=None)[torch.tensor([0])].points is scene.points
     without = replace(scene, points=points[:5])[torch.tensor([4])]
-    assert without.points is None  # not an empty set, at which nothing could start
+    assert without.points is None  # not an empty set, where nothing could start
 
 
 def test_points_that_leave_the_range_of_numbers_go_with_their_sightings() -> None:
@@ -149,7 +149,7 @@ def test_reasons_to_doubt_a_point() -> None:
 
 
 def test_what_is_known_without_held_out_images() -> None:
-    """Image 9 is held out. Points without a track, and those that training images alone see, are known as they are."""
+    """Image 9 is held out. Points without a track, and points that training images alone see, are known as they are."""
     sees = {0: [], 1: [3], 2: [3, 4], 3: [3, 9], 4: [3, 4, 9], 5: [9], 6: [3, 3]}
     pairs = [(image, point) for point, images in sees.items() for image in images]
     images, seen = torch.tensor(pairs).unbind(-1)

@@ -22,12 +22,12 @@ def test_images_are_spread_as_regnerf_and_freenerf_spread_them(total: int, count
 
 
 def test_three_of_ferns_17_training_images() -> None:
-    """Of 20 photographs every eighth is held out; of the other 17, the published protocol takes these."""
+    """Every eighth of 20 photographs is held out; the published protocol takes these of the other 17."""
     assert evenly_spread(17, 3) == [0, 8, 16]
 
 
 def test_the_eight_views_of_blender_scenes_are_numpys_first_choice() -> None:
-    """DietNeRF's and FreeNeRF's programs draw them with numpy's seed 0, which is what --train-image-indices is for."""
+    """DietNeRF's and FreeNeRF's programs draw them with numpy's seed 0; --train-image-indices selects them."""
     drawn = np.random.RandomState(0).choice(np.arange(100), size=8, replace=False)
     assert drawn.tolist() == [26, 86, 2, 55, 75, 93, 16, 73]
 

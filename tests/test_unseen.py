@@ -37,7 +37,7 @@ def test_two_cameras_have_the_line_between_and_a_little_behind_them() -> None:
 
 
 def test_views_stand_evenly_around_a_camera_and_its_neighbours() -> None:
-    """The position is uniform over a triangle: its mean is the middle, its covariance that of the triangle."""
+    """The position is uniform over a triangle: its mean is the middle, its covariance the triangle's."""
     torch.manual_seed(0)
     found = unseen_poses(FAR, torch.randint(3, (20_000,)))
     corners = TRIANGLE[:, :, 3].double()

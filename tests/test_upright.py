@@ -1,4 +1,4 @@
-"""What is up where photographs lie on their side."""
+"""The up direction of photographs that lie on their side."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 def looking(origins: Tensor, at: Tensor, roll: float) -> Tensor:
     """Return poses (M, 3, 4) of cameras that look at a point (3,) or points (M, 3), rolled by an angle, degrees.
 
-    With a roll of 90, what is up in the world is to the left in the image.
+    A roll of 90 puts the world's up direction to the left in the image.
     """
     ahead = torch.nn.functional.normalize(at - origins, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(ahead, Z.expand_as(ahead)), dim=-1)
@@ -121,7 +121,7 @@ needs_data = pytest.mark.skipif(DATA is None, reason="NERFLOOM_DATA is not set")
 
 @needs_data
 def test_a_real_capture_on_its_side_stands_on_its_table() -> None:
-    """The cup lies in the photographs. Most of the points are of the desk, in one plane, whose normal is up."""
+    """The cup lies in the photographs. Most of the points are on the desk, in one plane; its normal is up."""
     assert DATA is not None
     path = Path(DATA) / "colmap_cup"
     turned, as_is = (Colmap(orientation_method=way).parse(path, "train") for way in ("auto", "up"))  # type: ignore[arg-type]

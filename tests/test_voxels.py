@@ -217,7 +217,7 @@ def test_dropped_leaves_change_a_ray_by_their_weights_at_most() -> None:
     differences = (colors(model, rays) - before).abs().amax(-1)
     assert float(differences.max()) > 0.01
     assert bool((differences <= bound + 1e-5).all())
-    assert all(bool(state["exp_avg"].all()) for state in optimizer.state.values())  # what stays goes on
+    assert all(bool(state["exp_avg"].all()) for state in optimizer.state.values())  # kept leaves go on
 
 
 def test_no_more_leaves_than_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
@@ -310,7 +310,7 @@ def test_what_is_refused(facts: dict[str, Any], settings: dict[str, Any], words:
 
 def test_damaged_checkpoints_are_refused() -> None:
     state = {name: value.clone() for name, value in filled().state_dict().items()}
-    restore_model(built(), {"model": state})  # whatever its leaves are
+    restore_model(built(), {"model": state})  # with any leaves
     for changes in (
         {"cells": state["cells"].flip(0)},
         {"cells": state["cells"][:-1]},

@@ -1,4 +1,4 @@
-"""Zip-NeRF: what the scene decides, and that each part does what it says."""
+"""Zip-NeRF: decisions from the scene, and the effect of each part."""
 
 import dataclasses
 from functools import partial
@@ -26,7 +26,7 @@ from tests.kernels.compiled import needs_kernels
 from tests.training.helpers import TINY, chosen, said_otherwise, tiny_run, tiny_trainer
 
 captured = partial(said_otherwise, "zip-nerf")
-"""A trainer on the tiny data set, of whose scene other things are said."""
+"""A trainer on the tiny data set with other facts of its scene."""
 
 
 def test_an_object_before_no_background_needs_little(shared_tiny: Path, tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_an_object_is_marched_through_and_a_capture_has_proposals(shared_tiny: P
 
 @pytest.mark.slow
 def test_through_a_box_it_keeps_what_every_method_must() -> None:
-    """With proposals it is checked beside all built-in methods in tests/test_check_method.py."""
+    """tests/test_check_method.py checks it with proposals, beside all built-in methods."""
     marched = {"sampler": "occupancy", "grid_resolution": 16, "num_steps": 64, "samples_per_batch": 4096}
     findings = check_method(METHOD, "zip-nerf", dataclasses.replace(METHOD.config, **{**TINY["zip-nerf"], **marched}))
     assert [finding.line() for finding in findings if not finding.ok] == []
@@ -127,7 +127,7 @@ def test_marched_samples_need_no_flag_about_poses(shared_tiny: Path, tmp_path: P
 
 @pytest.mark.parametrize("asked", [{}, {"contraction": True}])
 def test_an_occupancy_grid_sees_all_of_space_too(asked: dict[str, object], shared_tiny: Path, tmp_path: Path) -> None:
-    """What is marched through in nested boxes, the field must tell apart: two places far outside of the box."""
+    """The field must tell places in nested boxes apart: here two places far outside of the box."""
     trainer = captured(shared_tiny, tmp_path, {"unbounded": not asked}, sampler="occupancy", **asked)
     field = trainer.model.field
     torch.nn.init.normal_(field.encoding.table, std=0.1)
@@ -178,7 +178,7 @@ def test_frustums_that_shrink_to_a_point_are_points_without_size(field: Multisam
 
 
 def test_patterns_are_turned_in_training_only(field: MultisampledField) -> None:
-    """By the start of a frustum: the same again for the same one."""
+    """The start of a frustum determines its pattern, so equal frustums have equal patterns."""
     frustums = cones(40)
     points = Points(frustums.origins, frustums=frustums)
     fixed = field.density(points)[0]
@@ -190,7 +190,7 @@ def test_patterns_are_turned_in_training_only(field: MultisampledField) -> None:
 
 @needs_kernels
 def test_what_a_march_has_evaluated_is_not_evaluated_again(field: MultisampledField) -> None:
-    """In training too, where patterns are turned."""
+    """This holds in training too, where patterns are turned."""
     torch.manual_seed(0)
     frustums, order = cones(60), torch.randperm(60)[:40]
 
@@ -218,7 +218,7 @@ def test_what_a_march_has_evaluated_is_not_evaluated_again(field: MultisampledFi
 
 @pytest.mark.medium
 def test_images_of_other_exposure_get_functions_of_their_own(shared_tiny: Path, tmp_path: Path) -> None:
-    """With each second image darkened, the functions of the darker ones darken, and in the mean they change little."""
+    """Each second image is darkened: its function darkens, and in the mean functions change little."""
     still: Dataset = tiny_trainer("zip-nerf", shared_tiny, tmp_path / "still").train_set
     dark = torch.arange(len(still)) % 2 == 0
     sizes = still.cameras.widths * still.cameras.heights

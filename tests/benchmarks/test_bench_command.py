@@ -1,4 +1,4 @@
-"""ns-bench and python -m benchmarks: each is listed, helped and reached, and says in one line what it refuses."""
+"""ns-bench and python -m benchmarks: each is listed, has help and runs, and refuses bad input in one line."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""A city on paper: the page is what the command prints, and formulas agree with what the package does."""
+"""A city on paper: the page equals the command's output, and formulas agree with the package."""
 
 import json
 import math
@@ -30,7 +30,7 @@ def test_the_page_shows_what_the_command_prints() -> None:
 
 
 def test_images_of_a_block_are_those_of_a_grid() -> None:
-    """A lattice of cameras in a plane, in blocks of a grid: those within have about as many as the formula says."""
+    """A lattice of cameras in a plane, in blocks of a grid: inner blocks have about the formula's number."""
     side, blocks = 60, 6
     x, y = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
     positions = torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3).double()

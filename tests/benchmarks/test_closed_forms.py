@@ -34,7 +34,7 @@ def rays_from(origins: Tensor, targets: Tensor, near: float, far: float) -> Rays
 
 
 def awkward_rays() -> Rays:
-    """From outside, from inside, past everything, and along the axes: inside, outside and in the fog's faces."""
+    """Rays from outside, from inside, past everything, and along the axes: inside, outside and in the fog's faces."""
     draws = torch.Generator().manual_seed(0)
     outside = torch.nn.functional.normalize(torch.randn(10, 3, generator=draws, dtype=F64), dim=-1) * 4
     inside = torch.rand(10, 3, generator=draws, dtype=F64) - 0.5
@@ -107,7 +107,7 @@ def test_scenes_lie_in_their_box_and_have_colours(name: str) -> None:
 
 
 def test_through_the_middle_of_a_ball() -> None:
-    """Two radii of one colour, and a hollow ball, whose walls are what is left."""
+    """A ball has two radii of one colour; of a hollow ball the walls remain."""
     ball, hollow = Medium(Ball(0.5), 3.0, (0.2, 0.4, 0.6)), Medium(Ball(0.4), 0.0)
     ray = rays_from(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 3), 0.0, 4.0)
     for scene, length in ((Solids(ball), 1.0), (Solids(ball, hollow), 0.2)):

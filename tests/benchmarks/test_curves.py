@@ -1,4 +1,4 @@
-"""PSNR against seconds of training: what is run, what is kept, and what is made of it."""
+"""PSNR against seconds of training: the runs, the kept results, and the output."""
 
 import json
 from pathlib import Path

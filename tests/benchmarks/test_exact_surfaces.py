@@ -1,4 +1,4 @@
-"""Points on exact surfaces, and what cameras see of them, against closed forms."""
+"""Points on exact surfaces, and their visibility from cameras, against closed forms."""
 
 import math
 
@@ -20,7 +20,7 @@ def test_points_are_even_on_the_surface_of_a_ball() -> None:
     points, normals = surface_sample(ball, CUBE, 20_000)
     assert float(ball(points).abs().max()) < 1e-9
     torch.testing.assert_close(normals, points, atol=1e-4, rtol=0)
-    # By Archimedes, heights are uniform; the shell is uneven by its thickness squared.
+    # Heights are uniform (Archimedes); the shell is uneven by its thickness squared.
     assert float((points.sort(0).values - torch.linspace(-1, 1, 20_000)[:, None]).abs().max()) < 0.03
 
 

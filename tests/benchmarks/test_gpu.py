@@ -1,4 +1,4 @@
-"""ns-bench gpu: what can be tested of it without a GPU."""
+"""ns-bench gpu: the parts that can be tested without a GPU."""
 
 import copy
 from pathlib import Path
@@ -44,7 +44,7 @@ def test_kernels_of_rays_are_right() -> None:
 
 
 def test_steps_are_timed_as_they_are_and_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the CPU, which has no graphs, they are the same steps."""
+    """The CPU has no graphs, so they are the same steps."""
     monkeypatch.setattr("nerfloom.benchmarks.gpu.SIZE", 16)
     small = {"num_rays_per_batch": 16, "log2_table_size": 8, "num_levels": 2}
     rows = timed_steps(torch.device("cpu"), 1, 2, **small)
@@ -57,7 +57,7 @@ def test_steps_are_timed_as_they_are_and_repeated(monkeypatch: pytest.MonkeyPatc
 
 
 def test_parts_for_which_too_little_time_is_left_are_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
-    """Of 100 s, the first part takes 30; the second would need 80, and the third has the 70 that it needs."""
+    """The first part takes 30 of 100 s; the second would need 80, and the third has the 70 that it needs."""
     now, given, kept = [0.0], dict[str, float](), list[dict[str, Any]]()
 
     def part(name: str, least: float, takes: float) -> Part:

@@ -33,7 +33,7 @@ def test_means_over_seeds_with_the_spread_of_a_run() -> None:
     assert row["test PSNR, dB"] == 31.0
     assert row["standard deviation of a run, dB"] == pytest.approx(math.sqrt(2), abs=1e-3)
     missed = ablation.summary([(10.0, 30.0), (None, 32.0)])
-    assert missed["seconds to the target"] is None  # a mean over those that met it would flatter the variant
+    assert missed["seconds to the target"] is None  # a mean over runs that met it would flatter the variant
     assert ablation.summary([(10.0, 30.0)])["standard deviation of a run, dB"] is None
 
 

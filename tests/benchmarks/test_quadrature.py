@@ -1,4 +1,4 @@
-"""What the benchmark says of samplers, on few rays: errors fall as they should, bounds hold, evaluations count."""
+"""The benchmark of samplers, on few rays: errors fall as expected, bounds hold, evaluations are counted."""
 
 import json
 import math
@@ -33,7 +33,7 @@ TINY = Sizes(counts=(8, 16), rays=64, skipping_rays=100, fit_steps=4, grid_resol
 
 
 def errors_of_even_samples(scene: ClosedForm, rays: Rays, counts: tuple[int, ...]) -> list[float]:
-    """Mean errors of one sample in the middle of each of so many equal intervals."""
+    """Mean errors of one sample in the middle of each of `counts` equal intervals."""
     truth = scene.truth(rays, WHITE).color
     render = [partial(sampled, scene, UniformSampler(count), False) for count in counts]
     return [measured("", "", n, r, rays, truth).mean_error for n, r in zip(counts, render, strict=True)]

@@ -1,4 +1,4 @@
-"""Tables of results: their rows, what is run and what is kept, and the figures that they show."""
+"""Tables of results: their rows, their runs, the kept results, and the figures that they show."""
 
 import json
 import signal
@@ -126,7 +126,7 @@ def test_what_is_no_table(text: str, reason: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", TABLES, ids=lambda path: path.stem)
 def test_every_row_of_our_tables_is_understood(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the commands that are run, which are parsed as they will be; the data need not be there."""
+    """The commands of each row are parsed; the data need not be there."""
     formats = {"fern": "llff", "statue_of_liberty": "llff", "record3d_door": "record3d", "lego": "blender"}
     formats |= {"bouncingballs": "dnerf", "standup": "dnerf", "solids": "blender"}
 
@@ -146,7 +146,7 @@ def test_every_row_of_our_tables_is_understood(path: Path, monkeypatch: pytest.M
 
 
 def rows_of(folder: Path) -> dict[str, Any]:
-    """What is kept of `write`'s table."""
+    """The kept rows of `write`'s table."""
     return json.loads((folder / "table.json").read_text())["rows"]
 
 

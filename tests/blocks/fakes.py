@@ -1,4 +1,4 @@
-"""Blocks about which everything is known: pictures in closed form, in scenes of their own."""
+"""Fully known blocks: pictures in closed form, in scenes of their own."""
 
 import math
 from pathlib import Path
@@ -23,7 +23,7 @@ def scene() -> Scene:
 
 
 class Shown(Renderable):
-    """Pictures whose colours are an affine function of the pixel's place, of one distance and one opacity.
+    """Pictures with colours that are an affine function of the pixel's place, of one distance and one opacity.
 
     Args:
         matrix: (3, 4) from (row, column, their product, 1), each in [0, 1], to colours.

@@ -65,7 +65,7 @@ def test_a_picture_changes_and_its_background_does_not() -> None:
 
 
 def test_gaussians_change_as_pixels_do() -> None:
-    """Whatever the harmonics are in a direction: colour is linear in them."""
+    """This holds for every direction, because colour is linear in the harmonics."""
     random = torch.Generator().manual_seed(0)
     means, turns = torch.zeros(5, 3), torch.tensor([1.0, 0, 0, 0]).repeat(5, 1)
     colors, harmonics = torch.randn(5, 3, generator=random), torch.randn(5, 3, 8, generator=random)

@@ -91,7 +91,7 @@ def test_what_is_far_is_not_opened() -> None:
 
     model = Blocks(blocks, few_in_memory(load, 2), placement(1.0), scene())
     model.render_view(View(cameras([(204.0, 0.0, 0.0)])), BLACK)
-    assert sorted(set(asked)) == [0, 20, 21]  # the first tells what all have in common
+    assert sorted(set(asked)) == [0, 20, 21]  # the first tells the shared facts
     assert len(asked) == 3
 
 

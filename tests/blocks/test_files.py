@@ -1,4 +1,4 @@
-"""blocks.yml: what is written is read, and everything wrong is answered in one line."""
+"""blocks.yml: written files are read, and every fault is refused in one line."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +17,7 @@ COLOR = ((1.1, 0.0, 0.0, 0.25), (0.0, 1.0, 1e-7, 0.0), (0.0, 0.0, 0.9, -0.1))
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """A file with two blocks, one of which has its run elsewhere."""
+    """A file with two blocks; one has its run elsewhere."""
     (tmp_path / "scene" / "runs" / "000").mkdir(parents=True)
     (tmp_path / "elsewhere").mkdir()
     blocks = (

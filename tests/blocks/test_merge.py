@@ -52,7 +52,7 @@ def test_missing_degrees_are_0() -> None:
 
 
 def test_blocks_in_scenes_of_their_own_give_the_gaussians_back() -> None:
-    """What two blocks hold of one cloud, each in its own frame, is the cloud in the frame of the whole."""
+    """Two blocks' parts of one cloud, each in its own frame, give the cloud in the frame of the whole."""
     whole, own = placement(0.5, (1.0, 2.0, 0.0)), (placement(2.0, angle=0.4), placement(3.0, (0.0, -4.0, 1.0)))
     models = [DrawnGaussians(transformed(cloud(), *each.similarity()), Look(), scene()) for each in own]
     blocks = [block((0.0, 0.0, 0.0), 4.0), block((4.0, 0.0, 0.0), 4.0)]

@@ -1,4 +1,4 @@
-"""Visibility networks: labels in closed form, what a network learns of a wall, and blocks that are left out."""
+"""Visibility networks: labels in closed form, a network trained on a wall, and left-out blocks."""
 
 import math
 from pathlib import Path

@@ -23,7 +23,7 @@ def plan(folder: Path, *labels: str, repeats: int = 1) -> Plan:
 
 
 def finish(planned: PlannedRun, psnr: float, seconds: float = 60.0, **changes: Any) -> None:
-    """Write what a finished run leaves."""
+    """Write the files of a finished run."""
     planned.folder.mkdir(parents=True)
     summary = {
         "method": planned.contender.method,
@@ -56,10 +56,10 @@ def finish(planned: PlannedRun, psnr: float, seconds: float = 60.0, **changes: A
 
 
 def at_once(outcome: Callable[[PlannedRun, float], str | None]) -> Callable[..., dict[Job, Failure]]:
-    """A launcher's `run` whose jobs end at once.
+    """A launcher's `run` with jobs that end at once.
 
     Args:
-        outcome: makes the files of a run, given its seconds of training; returns why it failed, if so.
+        outcome: makes the files of a run, given its seconds of training; returns the reason of a failure, or None.
     """
 
     def run(_: object, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
@@ -74,7 +74,7 @@ def at_once(outcome: Callable[[PlannedRun, float], str | None]) -> Callable[...,
 
 
 def draw(planned: PlannedRun, seed: int, names: tuple[str, ...] = ("0000_r_0", "0001_r_1"), size: int = 64) -> None:
-    """Write renders whose upper left quarter is worst, and their photographs."""
+    """Write renders with the worst error in the upper left quarter, and their photographs."""
     import torch
 
     noise = torch.from_numpy(np.random.default_rng(0).random((size, size, 3))).float()

@@ -52,7 +52,7 @@ def test_words_are_those_of_a_shell() -> None:
 
 @pytest.mark.parametrize("seconds", [math.nan, math.inf])
 def test_a_budget_without_end_is_refused(seconds: float) -> None:
-    """As a recipe can have it: YAML knows .nan and .inf."""
+    """A recipe can have such a budget: YAML knows .nan and .inf."""
     with pytest.raises(ConfigError, match=r"--max-seconds is (nan|inf); it must be more than 0 and finite"):
         plan_of(CompareFlags(methods=("instant-ngp",), max_seconds=seconds))
 

@@ -1,4 +1,4 @@
-"""The report: complete, self-contained, and honest about what is missing."""
+"""The report: complete, self-contained, and with missing values marked."""
 
 import base64
 import csv
@@ -78,7 +78,7 @@ def test_tables_in_markdown_and_csv_and_json(compared: Plan) -> None:
 
 
 def test_the_terminal_s_table_fits_eighty_columns() -> None:
-    """With six methods, one of them a long name."""
+    """The table has six methods, one of them with a long name."""
     labels = [*LABELS, "kplanes", "nerfacto", "dnerf --sampler occupancy --canonical hash-grid"]
     table = console_table(rows_of(labels, [], {label: ["no luck"] for label in labels}))
     console = Console(width=80, file=io.StringIO())

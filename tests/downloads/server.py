@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Served:
-    """A file and how it is served; what was asked for is noted."""
+    """A file and how it is served; requests are recorded."""
 
     content: bytes
     etag: str | None = None
     """Sent with the file, and compared with If-Range; the content's sum if None."""
     breaks_after: list[int] = field(default_factory=list)
-    """Numbers of bytes after which the first answers are cut off, one for each."""
+    """Numbers of bytes sent before the first answers are cut off, one for each."""
     status: list[int] = field(default_factory=list)
     """Statuses of the first answers, in place of the file."""
     headers: dict[str, str] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Fetching from a server with faults: what arrives is the file, whole and as the source says, or nothing."""
+"""Fetching from a server with faults: the result is the whole file, as the source states it, or nothing."""
 
 import base64
 import errno
@@ -192,7 +192,7 @@ def test_a_disk_that_fills_up_keeps_what_came(tmp_path: Path, monkeypatch: pytes
 
 
 class _Full:
-    """An open file whose disk fills up."""
+    """An open file on a disk that fills up."""
 
     def __init__(self, opened: Any, write: Any) -> None:
         self._opened, self._write = opened, write

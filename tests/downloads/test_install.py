@@ -38,7 +38,7 @@ def dataset_of(*archives: Archive) -> Dataset:
 
 @pytest.fixture
 def balls(shared_tiny: Path) -> bytes:
-    """Two scenes in the layout of NeRF-Synthetic's archive, with what macOS leaves and a text about both."""
+    """Two scenes in the layout of NeRF-Synthetic's archive, with macOS's hidden files and a text about both."""
     extra = {"__MACOSX/balls/red/._x.png": b"?", "balls/.DS_Store": b"?", "balls/README.txt": b"CC0"}
     return zipped(shared_tiny, "balls/red", "balls/blue", extra=extra)
 
@@ -93,7 +93,7 @@ def test_a_scene_alone_in_its_archive_may_have_another_folder(shared_tiny: Path,
 
 
 def test_the_outermost_folder_is_the_scene(shared_tiny: Path, tmp_path: Path) -> None:
-    """Tanks and Temples has a scene 'train', which is also what the images' folder of others may be called."""
+    """Tanks and Temples has a scene 'train', which is also a name of the images' folder of other scenes."""
     with serving({"/x.zip": Served(zipped(shared_tiny, "tandt/truck", "tandt/train"))}) as address:
         dataset = dataset_of(Archive("x.zip", ("train", "truck"), (Source(f"{address}/x.zip"),)))
         truck, train = install("tandt", dataset, tmp_path, ["truck", "train"])

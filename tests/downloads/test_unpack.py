@@ -20,7 +20,7 @@ def write_zip(path: Path, files: dict[str, bytes], compression: int = zipfile.ZI
 
 
 def refused(archive: Path, folder: Path) -> str:
-    """The message with which an archive is refused; nothing was written."""
+    """The message that refuses an archive; nothing was written."""
     before = sorted(folder.parent.rglob("*"))
     with pytest.raises(DataError) as error:
         unpack(archive, folder, lambda parts: parts)

@@ -1,4 +1,4 @@
-"""Surfaces whose distances are known."""
+"""Surfaces with known distances."""
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ def together(*surfaces: Surface) -> Surface:
 
 
 def sphere(radius: float = 1.0, level: int = 5) -> Surface:
-    """A sphere of triangles whose corners are on it."""
+    """A sphere of triangles with corners on it."""
     import trimesh
 
     made = trimesh.creation.icosphere(subdivisions=level, radius=radius)

@@ -1,4 +1,4 @@
-"""Pictures: pixels as means over their area, whatever the chunks."""
+"""Pictures: pixels as means over their area, for chunks of any size."""
 
 import math
 from dataclasses import replace
@@ -155,7 +155,7 @@ def test_means_over_pixels_are_means() -> None:
         ("black", True, 0.0),
         ("auto", False, 0.0),
         ("random", False, 0.0),
-        ("white", False, 1.0),  # what is white may have been learnt as empty
+        ("white", False, 1.0),  # white parts may have been learnt as empty
         ("black", False, 0.0),
     ],
 )
@@ -184,7 +184,7 @@ def test_pictures_are_of_views_evenly_spaced_and_of_the_worst(shared_tiny: Path,
 def test_as_many_images_as_fit_the_time_evenly_spaced_and_it_is_said(
     shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By the time of the first image: 3 s each, of 10 s."""
+    """The time of the first image decides: 3 s each, of 10 s."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     images, timed = trainer.train_set, evaluator._timed
     monkeypatch.setattr(evaluator, "_timed", lambda work, title: (timed(work, title)[0], 3.0))
@@ -234,7 +234,7 @@ def test_views_far_below_the_mean_are_named() -> None:
 
 
 def test_a_picture_that_is_not_finite_has_metrics_that_are_not(shared_tiny: Path, tmp_path: Path) -> None:
-    """As of a pose that is NaN: the evaluation ends, and says so in its figures."""
+    """A pose that is NaN gives one: the evaluation ends, and says so in its figures."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True)
     assert trainer.eval_set is not None
     poses = trainer.eval_set.cameras.camera_to_worlds.clone()
@@ -250,7 +250,7 @@ def test_a_picture_that_is_not_finite_has_metrics_that_are_not(shared_tiny: Path
 
 
 def test_speeds_are_of_images_and_of_their_rays(shared_tiny: Path, tmp_path: Path) -> None:
-    """In the same time: an image has 20 x 20 pixels of four rays."""
+    """Both are measured in the same time: an image has 20 x 20 pixels of four rays."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", evaluated=True, rays_per_pixel=4)
     found = evaluate(trainer.model, trainer.eval_set)
     seconds = sum(row["seconds"] for row in found.per_image)

@@ -111,7 +111,7 @@ def test_points_as_reference() -> None:
 
 @pytest.mark.medium
 def test_only_what_cameras_see_counts() -> None:
-    """A wrong far side of a sphere, which no camera sees, and what is left out, in closed form."""
+    """A sphere's far side is wrong, but no camera sees it; the left-out part is known in closed form."""
     right = sphere()
     wrong = replace(right, points=right.points * (1 - 0.3 * (right.points[:, :1] < 0.1)))
     cameras = cameras_at(torch.tensor([[4.0, 0.0, 0.0]]), 60.0, 400)
@@ -142,7 +142,7 @@ def test_cameras_are_in_another_frame_than_the_surface() -> None:
 
 @pytest.mark.medium
 def test_a_surface_far_from_the_reference_is_judged_and_not_left_out() -> None:
-    """Inside of the reference, which would hide it: distances are what they are."""
+    """The surface is inside of the reference, which would hide it: its distances count all the same."""
     cameras = cameras_at(torch.tensor([[4.0, 0.0, 0.0], [-4.0, 0.0, 0.0]]), 60.0, 400)
     views = Views(cameras, HERE, lambda index: None, lambda index: None)
     found = judge_surface(sphere(0.5), sphere(), views, count=1000)

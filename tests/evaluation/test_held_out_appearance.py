@@ -103,7 +103,7 @@ class LitBall(RendersRays):
 
 @pytest.mark.parametrize("kind", ["affine", "tone", "grid"])
 def test_half_of_an_image_tells_a_known_light(kind: str) -> None:
-    """The colours of the ball's right half are others, and are right too. What cameras share stays as it is."""
+    """The colours of the ball's right half are others, and are right too. Shared parameters stay as they are."""
     still, behind = ball_in_a_box(40), torch.zeros(3)
     gains, colors = torch.tensor([0.5, 0.4, 0.45]), still.pixels[:, :3].float() / 255
     dark = to_srgb(gains**2.2 * to_linear(colors)) if kind == "tone" else gains * colors

@@ -1,4 +1,4 @@
-"""Pictures: what is written is read back by an independent reader."""
+"""Pictures: an independent reader reads back the written files."""
 
 from pathlib import Path
 

@@ -88,7 +88,7 @@ def test_lpips_of_some_pixels_is_the_mean_of_its_map(arrays: Arrays, weights: Pa
     spread = (functional.interpolate(torch.from_numpy(each)[None, None], (60, 52), mode="bilinear") for each in maps)
     expected = sum(each[0, 0][kept].mean().item() for each in spread)
     assert measure(image, target, kept) == pytest.approx(expected, rel=1e-5)
-    assert measure(image, target, kept) > 1.5 * measure(image, target, None)  # what is ignored does not count as right
+    assert measure(image, target, kept) > 1.5 * measure(image, target, None)  # ignored pixels do not count as right
 
 
 def without(name: str, arrays: Arrays) -> Arrays:

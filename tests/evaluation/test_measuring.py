@@ -42,7 +42,7 @@ SCENE = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 10.0, 4, True, False, 
 
 
 class Ball(RendersRays):
-    """A ball around the origin, whose depth is off by a fraction."""
+    """A ball around the origin, with a depth that is off by a fraction."""
 
     scene = SCENE
     device = torch.device("cpu")
@@ -81,7 +81,7 @@ class Coated(Ball):
 
 
 class Refined(Ball):
-    """The same, whose training cameras stand elsewhere than the data say: all are moved alike."""
+    """The same, with training cameras away from the data's poses: all are moved alike."""
 
     def __init__(self, count: int, shift: Tensor) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ def around(count: int = 40) -> Cameras:
 
 @pytest.mark.parametrize(("model", "tolerance"), [(Ball(), 1e-6), (Ball(0.002), 8e-3), (Surface(0.002), 1e-6)])
 def test_the_point_at_a_pixel(model: Ball, tolerance: float) -> None:
-    """On the ball, and seen at that pixel; a signed distance mends a depth that is a little off."""
+    """The point is on the ball, and seen at that pixel; a signed distance mends a depth that is a little off."""
     cameras = around()
     for column, row in ((49.5, 49.5), (30.2, 61.7)):
         point = surface_point(model, View.of(cameras, 3), column, row)
@@ -111,7 +111,7 @@ def test_the_point_at_a_pixel(model: Ball, tolerance: float) -> None:
 
 
 def test_a_depth_far_from_the_level_set_is_kept() -> None:
-    """What stands before the surface, such as a floater, is what the pixel shows."""
+    """The pixel shows matter before the surface, such as a floater."""
     point = surface_point(Surface(-0.1), View.of(around(), 3), 49.5, 49.5)
     assert float(point.norm()) == pytest.approx(3 - 0.9 * (3 - RADIUS), abs=1e-5)
 
@@ -170,7 +170,7 @@ def test_lengths_are_measured_where_the_refined_cameras_stand() -> None:
 
 
 def test_the_cameras_that_see_a_point() -> None:
-    """Those above the plane that touches the ball there, whose image has the point."""
+    """The cameras are above the plane that touches the ball there, and have the point inside their image."""
     cameras = around()
     point = RADIUS * torch.nn.functional.normalize(torch.tensor([1.0, 0.4, -0.2], dtype=torch.float64), dim=0)
     height = cameras.camera_to_worlds[:, :, 3].double() @ point / RADIUS
@@ -258,7 +258,7 @@ def test_a_point_is_picked_in_the_picture_of_one_camera() -> None:
 
 
 def test_half_a_pixel_is_one_of_the_images_that_were_learnt_from() -> None:
-    """Of images at half the size it is twice as long."""
+    """It is twice as long for images of half the size."""
     ends = [RADIUS * torch.nn.functional.normalize(torch.tensor(each).double(), dim=0)
             for each in ([1.0, 0.4, -0.2], [0.8, -0.3, 0.4])]  # fmt: skip
     errors = []

@@ -72,7 +72,7 @@ def test_without_a_kernel_quick_ssim_is_ssim(monkeypatch: pytest.MonkeyPatch) ->
 def five_scales(image: np.ndarray, target: np.ndarray, kept: np.ndarray | None = None) -> float:
     """Wang, Simoncelli and Bovik 2003, in float64: scipy's filters on one channel after the other.
 
-    With masks, over the windows of each scale that lie on no pixel of the whole image that is ignored.
+    With masks, only windows of each scale count that lie on no ignored pixel of the whole image.
     """
     kept = np.ones(image.shape[:2], bool) if kept is None else kept
     taps = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))

@@ -42,7 +42,7 @@ def test_what_is_not_finite_is_not_hidden() -> None:
 
 @pytest.fixture
 def ball(tmp_path: Path) -> Dataset:
-    """Images of a ball whose colours are (normal + 1) / 2, and the same images as their normals."""
+    """Images of a ball with (normal + 1) / 2 as colours, and the same images as their normals."""
     dataset = ball_in_a_box()
     paths = tuple(tmp_path / f"{index}_normal.png" for index in range(len(dataset)))
     for index, path in enumerate(paths):

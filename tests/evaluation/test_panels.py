@@ -47,7 +47,7 @@ def test_every_part_is_there_whole_between_gaps(height: int, width: int, factor:
 
 
 def test_labels_and_ranges_are_written_in_the_margins() -> None:
-    """Ink above every part, and below those with a colour bar; taken away with the words."""
+    """There is ink above every part, and below parts with a colour bar; without words there is none."""
     panels = view_panels(*view(24, 24))
     picture = composed(panels)
     dark = (picture < 0.3).all(-1)

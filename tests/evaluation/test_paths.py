@@ -265,7 +265,7 @@ def test_few_cameras_are_one_stretch(places: list[float]) -> None:
 
 
 def test_a_walk_that_cannot_close_begins_behind_its_last_jump() -> None:
-    """From 4 back to 0 it would fly past everything; from the second stretch to the first one likewise."""
+    """Closing from 4 back to 0 would fly past everything; from the second stretch to the first one likewise."""
     open_walk = walk_of(along([float(place) for place in range(10)]), closed=True)
     assert (parts_of(open_walk), open_walk.closed) == ([list(range(10))], False)
     ring = walk_of(standing(torch.arange(0, 360, 20)), closed=True)

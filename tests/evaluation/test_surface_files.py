@@ -1,4 +1,4 @@
-"""Surfaces from files: those that we write, those of trimesh, and damaged ones."""
+"""Surfaces from files: ours, trimesh's, and damaged ones."""
 
 from pathlib import Path
 

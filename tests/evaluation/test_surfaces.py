@@ -1,4 +1,4 @@
-"""Surfaces: what of them can be used, and distances to them against all of their faces."""
+"""Surfaces: their usable parts, and distances to them against all of their faces."""
 
 import math
 from dataclasses import replace
@@ -66,13 +66,13 @@ def test_distances_are_those_to_the_nearest_of_all_faces() -> None:
     found, normals = nearest(points, surface)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)
     assert normals is not None
-    # Of a face of the sphere, about along the radius.
+    # The normal of a face of the sphere is about along the radius.
     radial = torch.nn.functional.normalize(points, dim=-1)
     assert float((normals * radial).sum(-1).min()) > 0.95
 
 
 def test_small_faces_are_found_beside_a_large_one() -> None:
-    """Two of 10^-8 of the area, on which no point is drawn."""
+    """Two faces have 10^-8 of the area, and no point is drawn on them."""
     surface = together(square(half=100.0), square(height=1.0, half=0.01))
     found, _ = nearest(torch.tensor([[0, 0, 1.5], [50, 50, 1.5]], dtype=torch.float64), surface)
     assert found.tolist() == pytest.approx([0.5, 1.5])

@@ -1,4 +1,4 @@
-"""Videos and folders of images: what is written is read back by an independent reader."""
+"""Videos and folders of images: an independent reader reads back the written files."""
 
 import errno
 import os
@@ -93,7 +93,7 @@ def test_distances_are_numbers(tmp_path: Path) -> None:
     write_distances([tmp_path / "a.png"], [np.append(distances, [[3.0, 9.0]], axis=0)], 3 / 65535)
     read = iio.imread(tmp_path / "a.png")
     assert read.dtype == np.uint16
-    # 0 is unknown, so the smallest distance is 1, and what lies beyond is the largest value.
+    # 0 is unknown, so the smallest distance is 1, and larger ones become the largest value.
     assert read.tolist() == [[0, 8738], [43690, 1], [65535, 65535]]
 
 

@@ -1,4 +1,4 @@
-"""What cameras see of a surface, against closed forms and rays."""
+"""Visible parts of a surface, against closed forms and rays."""
 
 import math
 from dataclasses import replace
@@ -41,7 +41,7 @@ def around(distance: float, *signs: float, angle: float = 60.0, size: int = 400)
 @pytest.mark.medium
 @pytest.mark.parametrize("distance", [2.0, 4.0, 20.0])
 def test_a_camera_sees_its_cap_of_a_sphere(distance: float) -> None:
-    """From a distance D of a sphere of radius R, the share (1 - R / D) / 2; all of it but for its rim."""
+    """A camera at the distance D from a sphere of radius R sees the share (1 - R / D) / 2, except for the rim."""
     points, found = sighted(sphere(), around(distance, 1.0))
     rays = torch.nn.functional.normalize(points - torch.tensor([distance, 0, 0]), dim=-1)
     cosine = -(rays * points).sum(-1)  # between ray and normal
@@ -79,7 +79,7 @@ def test_several_cameras() -> None:
 
 @pytest.mark.medium
 def test_what_is_outside_of_the_image_or_masked_is_not_seen() -> None:
-    """A camera at 10 whose image is narrower than a square at 0: 1/4 is inside, and of this half is masked."""
+    """A camera at 10 has an image narrower than a square at 0: 1/4 is inside, and half of this is masked."""
     half, distance = 1.0, 10.0
     angle = 2 * math.degrees(math.atan(half / 2 / distance))
     cameras = cameras_at(torch.tensor([[0.0, 0.0, distance]]), angle, 200)

@@ -1,7 +1,7 @@
 """Many faults, one after the other: python -m tests.faults --count 100 --output faults.json
 
-Ends with the number of faults of each kind, and what became of the runs; with status 1 where anything was lost, or a
-run did not end as one that nothing happened to.
+Ends with the number of faults of each kind, and the ends of the runs; with status 1 if anything was lost, or a run did
+not end as an undisturbed one.
 """
 
 import argparse

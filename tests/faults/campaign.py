@@ -1,7 +1,7 @@
 """Faults injected into runs at random moments, and whether anything that was committed is lost by them.
 
 A run is started, stopped, spoiled and resumed by one fault after the other; then it is let go on to its end, which must
-be that of a run that nothing happened to, to the last bit.
+equal an undisturbed run's, to the last bit.
 """
 
 import json
@@ -33,7 +33,7 @@ REPORTS = ("dataparser_transforms.json", "scene_profile.json", "summary.json", "
 
 
 class Broken(Exception):
-    """What must hold does not."""
+    """A condition that must hold does not."""
 
 
 def require(holds: object, what: str) -> None:
@@ -113,7 +113,7 @@ def dying_reader(stage: Stage) -> int | None:
 
 
 def second_process(stage: Stage) -> int | None:
-    """In the same folder, where the first stands still meanwhile, and is killed then."""
+    """It runs in the same folder; the first stands still meanwhile, and is killed then."""
     first = stage.start()
     until(lambda: first.poll() is not None or _held_by(stage.folder, first.pid))
     first.send_signal(signal.SIGSTOP)
@@ -171,12 +171,12 @@ FAULTS: dict[str, Fault] = {
 TAKES_ONE = "damaged checkpoint"
 """The only fault that removes a checkpoint: the newest."""
 DECK = (*FAULTS, "SIGKILL", "SIGKILL", "SIGTERM")
-"""What happens to a run, in an order of its own."""
+"""Faults of a run, in an order of its own."""
 
 
 @dataclass(frozen=True)
 class Injected:
-    """A fault, and what was left after it."""
+    """A fault, and the state after it."""
 
     kind: str
     committed: int
@@ -187,7 +187,7 @@ class Injected:
 
 @dataclass(frozen=True)
 class Report:
-    """What came of a campaign."""
+    """The results of a campaign."""
 
     injected: tuple[Injected, ...]
     runs: int
@@ -210,9 +210,9 @@ def run(base: Path, count: int, seed: int = 0, faults: Mapping[str, Fault] = FAU
     """Inject a number of faults, one after the other; fewer where runs give no occasion, or break.
 
     Args:
-        base: a folder for all that is written.
+        base: a folder for all files.
         seed: of the moments and the order; how far a run has come at a moment depends on the machine.
-        faults: by name; of those in `DECK` as often as they are there.
+        faults: by name; faults in `DECK` occur as often as they are there.
     """
     random, data = Random(seed), write_tiny(base / "ball")
     begun = time.monotonic()
@@ -250,8 +250,8 @@ def _disturbed(stage: Stage, faults: Mapping[str, Fault], truth: list[tuple[int,
     """Inject faults into a run, each once or as often as it is in `DECK`.
 
     Args:
-        truth: the learning curve of a run that nothing happens to.
-    Yields: those that there was occasion for. Raises: Broken where the answer to one is wrong.
+        truth: the learning curve of an undisturbed run. Yields: the faults that found an occasion. Raises: Broken if
+    the answer to one is wrong.
     """
     deck = [name for name in DECK if name in faults] + [name for name in faults if name not in DECK]
     for name in stage.random.sample(deck, len(deck)):

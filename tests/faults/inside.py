@@ -1,6 +1,6 @@
-"""ns-train where something is wrong with the world: python -m tests.faults.inside WORLD ARGUMENTS...
+"""ns-train in a faulty world: python -m tests.faults.inside WORLD ARGUMENTS...
 
-What goes wrong says `INJECTED` on standard error when it does.
+Each fault prints `INJECTED` on standard error when it happens.
 """
 
 import sys
@@ -15,7 +15,7 @@ from nerfloom.data.pixels.memory_mapped import MappedPixels
 INJECTED = "injected"
 DAY = 86_400.0
 READS = 2
-"""Of the thread that reads pixels ahead, before it dies."""
+"""Number of reads of the thread that reads pixels ahead, before it dies."""
 MAX_FILE = 20_000
 """Bytes. A checkpoint needs more, and nothing else does."""
 

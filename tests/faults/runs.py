@@ -1,4 +1,4 @@
-"""Runs of a tiny instant-ngp in processes of their own, and what they have on the disk."""
+"""Runs of a tiny instant-ngp in processes of their own, and their files."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def start(*arguments: object, world: str | None = None) -> subprocess.Popen[str]
     """ns-train in a process of its own.
 
     Args:
-        world: what is wrong around it, a key of `tests.faults.inside.WORLDS`.
+        world: the fault around it, a key of `tests.faults.inside.WORLDS`.
     """
     program = ["nerfloom.cli.train"] if world is None else ["tests.faults.inside", world]
     words = [sys.executable, "-m", *program, *map(str, arguments)]
@@ -44,7 +44,7 @@ def start(*arguments: object, world: str | None = None) -> subprocess.Popen[str]
 
 
 def ended(process: subprocess.Popen[str]) -> str:
-    """Wait for a process's end; returns what it said."""
+    """Wait for a process's end; returns its output."""
     try:
         return process.communicate(timeout=PATIENCE)[1]
     except subprocess.TimeoutExpired:
@@ -54,7 +54,7 @@ def ended(process: subprocess.Popen[str]) -> str:
 
 
 def wait_for_checkpoint(process: subprocess.Popen[str], folder: Path) -> None:
-    """Wait until a run has saved what it had not when this was called, or has ended."""
+    """Wait until a run has saved a new checkpoint, or has ended."""
     before = set(list_checkpoints(folder / FOLDER))
     until(lambda: process.poll() is not None or not set(list_checkpoints(folder / FOLDER)) <= before)
 
@@ -71,9 +71,9 @@ def readable_steps(folder: Path) -> list[int]:
 
 
 def curve(folder: Path) -> list[tuple[int, float]]:
-    """Steps and PSNR of a run's evaluations over all images, as written; of a file that was cut short this fails.
+    """Steps and PSNR of a run's evaluations over all images, as written; this fails for a file that was cut short.
 
-    When a few images are looked at follows the clock, so no two runs have that in common.
+    Evaluations of a few images follow the clock, so they differ between runs.
     """
     file = folder / "learning_curve.json"
     rows = json.loads(file.read_text()) if file.exists() else []

@@ -48,7 +48,7 @@ def test_a_clock_that_is_set_is_not_trained_by(shared_tiny: Path, tmp_path: Path
 
 @pytest.mark.medium
 def test_the_wall_clock_is_asked_for_nothing() -> None:
-    """It names folders, and tells people when a report was made; whatever is measured is by `perf_counter`."""
+    """It names folders, and tells people when a report was made; all measurements use `perf_counter`."""
     files = [file for folder in ("framework", "methods", "dataparsers") for file in (ROOT / folder).rglob("*.py")]
     assert len(files) > 30
     for file in files:

@@ -35,7 +35,7 @@ def flip(path: Path, place: int) -> None:
 
 
 def places(path: Path) -> dict[str, int]:
-    """Bytes of a checkpoint, by what they are in."""
+    """Bytes of a checkpoint, by the part that has them."""
     content = path.read_bytes()
     weights = next(value for value in load_checkpoint(path)["model"].values() if len(value.unique()) > 500)
     return {

@@ -1,4 +1,4 @@
-"""A disk that is full at any moment: what was there stays, what could not be written is said, the run goes on.
+"""A disk that is full at any moment: existing files stay, failed writes are reported, the run goes on.
 
 Checkpoints are tested with their own (`tests/training`), decoded pixels with theirs (`tests/test_cache.py`).
 """
@@ -34,7 +34,7 @@ def full(*_: Any, **__: Any) -> None:
 
 
 class FullFile:
-    """A file that takes half of what is written to it."""
+    """A file that takes half of each write."""
 
     def __init__(self, file: Any) -> None:
         self.file = file
@@ -158,7 +158,7 @@ def test_photographs_with_long_names_have_pictures(tiny: Path, tmp_path: Path) -
 
 
 def test_a_disk_that_fills_up_while_training(shared_tiny: Path, tmp_path: Path, disk: Disk) -> None:
-    """Really: room for one checkpoint and a half. The run trains to its end, keeps what it has, and is resumed."""
+    """A real disk, with room for 1.5 checkpoints. The run trains to its end, keeps what it has, and is resumed."""
     one = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "one", max_num_iterations=1, max_eval_images=0).train()
     disk(f"size={one.checkpoint.stat().st_size * 3 // 2 // 1024 + 64}k")
     settings = {"max_num_iterations": 12, "steps_per_save": 4, "max_eval_images": 0}

@@ -17,7 +17,7 @@ ReadOnly = Callable[[Path], None]
 
 
 def assert_all_refused(data: Path, folder: Path, a_run: Path, refused: Refused) -> None:
-    """To begin a run in a folder, to go on with one that is there, and to evaluate it."""
+    """Check that starting, resuming and evaluating a run in a folder are refused."""
     flags = ("--data", data, "--output-dir", folder, "--timestamp", "t", *TINY_NGP)
     assert refused(main, "instant-ngp", *flags).startswith(f"error: cannot write the run's folder {folder}")
     assert f"cannot write the run's folder {a_run}" in refused(main, "--resume", a_run)
@@ -58,7 +58,7 @@ def test_a_disk_that_is_read_only(shared_tiny: Path, tmp_path: Path, disk: Disk,
 def test_a_disk_that_becomes_read_only(
     shared_tiny: Path, tmp_path: Path, disk: Disk, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As Linux does where a disk fails: the run in memory goes on, and can be saved when it is over."""
+    """Linux does so if a disk fails: the run in memory goes on, and can be saved afterwards."""
     settings = {"max_num_iterations": 6, "steps_per_save": 2, "max_eval_images": 0}
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "disk" / "run", **settings)
     original, done = trainer.train_step, []

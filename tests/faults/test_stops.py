@@ -91,7 +91,7 @@ main()
 
 @pytest.mark.medium
 def test_a_stopped_command_exits_as_shells_expect(shared_tiny: Path, tmp_path: Path, forks: Forks) -> None:
-    """In a process of its own, while it saves all the time."""
+    """The command runs in a process of its own, and saves all the time."""
     flags, folder = runs.new_run(shared_tiny, tmp_path, 100_000)
     done = forks.run(STOPPED, folder / FOLDER, int(signal.SIGTERM), *flags)
     assert done.returncode == 143, done.stderr

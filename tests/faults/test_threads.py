@@ -20,7 +20,7 @@ from tests.training.helpers import tiny_trainer
 
 
 def error_of(work: Callable[[], object]) -> BaseException | None:
-    """What some work raises. A test fails where it does not end."""
+    """The error of some work. A test fails if it does not end."""
     raised: list[BaseException] = []
 
     def attempt() -> None:
@@ -54,7 +54,7 @@ class Dying:
 @pytest.mark.parametrize("error", [MemoryError("no memory"), OSError(5, "Input/output error"), SystemExit(1)])
 @pytest.mark.parametrize("calls", [0, 1, 2])
 def test_a_reader_of_pixels_that_dies_is_heard_of(error: BaseException, calls: int, tmp_path: Path) -> None:
-    """At once, while the first steps are taken, and in the middle: by the step that needs what it did not read."""
+    """It dies at once, during the first steps, or in the middle: the step that needs the unread pixels reports it."""
     scene = write_noise(tmp_path / "images", [(20, 10), (16, 16)])
     data = load_dataset(scene, "train", PixelMemory(0, tmp_path / "cache"))
     assert data.mapped is not None

@@ -1,4 +1,4 @@
-"""Two processes and one run's folder: the second is refused, whatever it wants; a dead one is in nobody's way."""
+"""Two processes and one run's folder: the second is refused in every case; a dead one is in nobody's way."""
 
 import errno
 import os

@@ -125,7 +125,7 @@ def test_frequencies_of_positions(opened: float) -> None:
 
 @pytest.mark.parametrize("opened", [1.0, 2.5])
 def test_closed_bands_of_directions_do_not_count(opened: float) -> None:
-    """With one band open, colour is the same from everywhere; with two and a half, it depends on the direction."""
+    """Colour is the same from everywhere with one band open; it depends on the direction with two and a half."""
     torch.manual_seed(0)
     field = EncodedField(torch.tensor([[-1.0] * 3, [1.0] * 3]), HashGrid(4, 2, 4, 16, 8), opening=True)
     assert field.direction_opening is not None

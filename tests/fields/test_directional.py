@@ -49,7 +49,7 @@ def test_steps_and_pictures(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["neus", "neus+frequency"])
 def test_normals_of_a_distance_are_its_gradients(kind: str) -> None:
-    """The light is that of the part, with the gradient's direction as the normal."""
+    """The light comes from the part, with the gradient's direction as the normal."""
     field = trainer_of(kind).model.field
     assert isinstance(field, SurfaceField)
     assert field.reflection is not None

@@ -11,7 +11,7 @@ from nerfloom.kernels.surfaces.opacity import laplace_density, surface_opacity
 from nerfloom.kernels.surfaces.samples import Intervals
 
 BOX = torch.tensor([[-1.0, -2.0, -2.0], [3.0, 2.0, 2.0]])
-"""A cube around (1, 0, 0), whose edge is 4."""
+"""A cube around (1, 0, 0) with an edge of 4."""
 
 
 def network(width: int = 48, frequencies: int = 2) -> NetworkDistance:
@@ -25,7 +25,7 @@ def places(count: int) -> Tensor:
 
 
 def test_it_starts_as_a_ball() -> None:
-    """Of half of the box's half edge, up to some per cent of it."""
+    """Its radius is half of the box's half edge, up to some per cent of it."""
     torch.manual_seed(0)
     found: Shape = NetworkDistance(BOX, 0.5)(places(1_000))
     offsets = places(1_000) - BOX.mean(0)
@@ -52,7 +52,7 @@ def test_its_gradient_is_that_of_finite_differences() -> None:
 
 
 def test_gradients_of_its_gradient_are_those_of_finite_differences() -> None:
-    """Of a loss on distance, gradient and features: along a random direction of all parameters, and by positions."""
+    """The loss is on distance, gradient and features: along a random direction of all parameters, and by positions."""
     net, where = network(), places(40).double().requires_grad_()
     weights = torch.randn(40, 48, dtype=torch.float64)
 

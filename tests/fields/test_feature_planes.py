@@ -1,4 +1,4 @@
-"""Feature planes that are resampled: what is looked up stays, and everything that depends on their size follows."""
+"""Resampled feature planes: looked-up values stay, and everything that depends on their size follows."""
 
 from pathlib import Path
 
@@ -74,7 +74,7 @@ def loss(planes: FeaturePlanes, positions: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("features", [3, 16, 32])
 def test_gradients_that_wait_move_the_table_as_those_that_do_not(features: int) -> None:
-    """One step of Adam from what the backward pass left in `deferred`, and from autograd's own gradient."""
+    """One step of Adam from the gradient in `deferred`, and from autograd's own gradient."""
     tables = []
     for sparse in (True, False):
         torch.manual_seed(0)

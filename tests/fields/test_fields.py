@@ -1,4 +1,4 @@
-"""Fields: what every sampler and renderer relies on, for each of them."""
+"""Fields: the properties that every sampler and renderer relies on, for each field."""
 
 import pytest
 import torch

@@ -51,7 +51,7 @@ def test_asking_for_normals_teaches_the_field_nothing() -> None:
 
 
 def test_penalties_in_closed_form() -> None:
-    """Of two rays one's normal is right and faces the camera, the other's is opposite and faces away."""
+    """One ray's normal is right and faces the camera, the other's is opposite and faces away."""
     samples = Samples.regular(torch.zeros(2, 1), torch.ones(2, 1))
     normals = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
     predicted = normals * torch.tensor([[1.0], [-1.0]])

@@ -18,7 +18,7 @@ SIZES = torch.tensor([[24, 16], [24, 16], [24, 16]])
 
 
 def cameras(model: str = "pinhole", lens: Tensor | None = None) -> Cameras:
-    """Three cameras around the origin, in float64, none of whose principal points is in the middle."""
+    """Three cameras around the origin, in float64, with principal points outside of the middle."""
     up, middle = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     places = torch.tensor([[3.0, 0.5, 1.0], [-1.0, 2.5, 2.0], [0.5, -3.0, -0.5]], dtype=torch.float64)
     poses = torch.stack([look_at(place, middle, up) for place in places])
@@ -32,7 +32,7 @@ def points(count: int = 200, seed: int = 0) -> Tensor:
 
 
 def ramps(dtype: torch.dtype = torch.float64) -> Tensor:
-    """Columns and rows of the pixels, as features: what is interpolated between them is linear, so exact."""
+    """Columns and rows of the pixels, as features: interpolation between them is linear, so exact."""
     rows, columns = torch.meshgrid(torch.arange(16, dtype=dtype), torch.arange(24, dtype=dtype), indexing="ij")
     return torch.stack([columns, rows])
 
@@ -53,7 +53,7 @@ def test_a_feature_is_that_of_the_pixel_that_shows_the_point() -> None:
 
 @pytest.mark.parametrize("model", ["opencv", "fisheye", "orthographic"])
 def test_features_follow_the_lens_of_a_camera(model: str) -> None:
-    """A point on the ray of a pixel gets the pixel's features, whatever bends the ray."""
+    """A point on the ray of a pixel gets the pixel's features, for every lens."""
     lens = torch.zeros(3, len(LENSES[model]), dtype=torch.float64)
     lens[:, :2] = torch.tensor([0.1, -0.02])[: lens.shape[1]]
     views = SourceViews((ramps(),) * 3, cameras(model, lens))
@@ -65,7 +65,7 @@ def test_features_follow_the_lens_of_a_camera(model: str) -> None:
 
 
 def test_colours_of_the_pixels_are_recovered() -> None:
-    """With an encoder that returns its image, a point on a pixel's ray has the pixel's own colour, in every view."""
+    """The encoder returns its image, so a point on a pixel's ray has the pixel's own colour, in every view."""
     images = torch.rand(3, 3, 16, 24, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     views = SourceViews(tuple(images), cameras())
     rays = views.cameras.pixel_rays_reference(torch.arange(3 * 24 * 16), 1.0, 5.0)
@@ -76,7 +76,7 @@ def test_colours_of_the_pixels_are_recovered() -> None:
 
 
 def test_a_coarser_map_covers_the_same_image() -> None:
-    """Each value of a map of half the size is that of the middle of four pixels."""
+    """Each value of a map of half the size belongs to the middle of four pixels."""
     coarse = ramps().unfold(1, 2, 2).unfold(2, 2, 2).mean((-1, -2))
     whole, halved = (SourceViews((features,) * 3, cameras()).aligned(points()) for features in (ramps(), coarse))
     inner = ((whole[..., 0] > 1) & (whole[..., 0] < 22) & (whole[..., 1] > 1) & (whole[..., 1] < 14))[..., None]
@@ -101,7 +101,7 @@ def test_features_have_the_gradient_of_interpolation() -> None:
 
 @pytest.mark.parametrize("size", [(16, 24), (13, 19)])
 def test_features_stay_in_the_middle_of_what_they_are_of(size: tuple[int, int]) -> None:
-    """An encoder whose convolutions copy their middle returns colours, or at coarser levels means, where they were."""
+    """An encoder with convolutions that copy their middle returns colours, or at coarser levels means, in place."""
     encoder = ImageEncoder((3, 3, 3))
     with torch.no_grad():
         for name, parameter in encoder.named_parameters():
@@ -126,7 +126,7 @@ def test_an_encoder_has_levels() -> None:
 
 
 def field_on(views: SourceViews | None) -> PixelAlignedField:
-    """A field whose parameters are all at work, in float64."""
+    """A field with all parameters at work, in float64."""
     torch.manual_seed(3)
     field = PixelAlignedField(2, 1.5, width=16, position_frequencies=3).double()
     for parameter in field.parameters():

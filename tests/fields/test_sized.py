@@ -44,7 +44,7 @@ def fields(unbounded: bool = False) -> list[Field]:
 
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_small_cones_are_points_and_large_ones_are_blurred(unbounded: bool) -> None:
-    """Of cones of the same axes: what a grid or the waves have between them is lost as they widen."""
+    """The cones have the same axes: detail of a grid or of waves between them is lost as they widen."""
     for field in fields(unbounded):
         found = {}
         for radius in (1e-6, 1e-5, 0.3, 30.0):
@@ -104,7 +104,7 @@ def test_values_and_gradients_are_finite_and_colours_reach_black_and_white(unbou
 
 
 def test_fields_are_asked_about_mere_positions_too() -> None:
-    """As by exports and the updates of occupancy grids; and about none."""
+    """Exports and the updates of occupancy grids do so; no position is allowed too."""
     for field in fields():
         sigma, _ = field.density(Points(torch.rand(7, 3) - 0.5))
         assert bool(sigma.isfinite().all())

@@ -1,6 +1,6 @@
 """A longer run, or one input again: python -m tests.fuzz --seconds 600 --reader nerfstudio --output counts.json
 
-Ends with what became of the inputs, and with status 1 where one got through.
+Ends with the results of the inputs, and with status 1 if one got through.
 """
 
 import argparse
@@ -23,7 +23,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the first input; the next ones follow")
     parser.add_argument("--module", default="tests.fuzz.readers", help="where READERS are")
     parser.add_argument("--output", type=Path, help="JSON file for the counts, the escapes and the versions")
-    parser.add_argument("--folder", type=Path, help="keep what is written there: data holds the last input")
+    parser.add_argument("--folder", type=Path, help="keep the files there: data holds the last input")
     flags = parser.parse_args()
     if flags.seconds is None and flags.count is None:
         flags.count = 100

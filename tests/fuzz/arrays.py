@@ -1,4 +1,4 @@
-"""Damage to numpy's files: a header that claims what is not there, kinds of values that nobody wants, and pickles."""
+"""Damage to numpy's files: a header with false claims, unwanted kinds of values, and pickles."""
 
 import ast
 import io

@@ -1,4 +1,4 @@
-"""Readers that do what readers must not, each in its own way: what fuzzing has to find, or it finds nothing."""
+"""Faulty readers, each with its own fault: fuzzing has to find them."""
 
 import ctypes
 import os

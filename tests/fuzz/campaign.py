@@ -16,7 +16,7 @@ from tests.fuzz.worker import Task
 
 ROOT = Path(__file__).parents[2]
 MAX_DEATHS = 50
-"""After which it is given up: something else is wrong."""
+"""Maximum number of dead workers; with more, something else is wrong."""
 
 
 def run(
@@ -68,12 +68,12 @@ def names(module: str = "tests.fuzz.readers") -> list[str]:
 
 
 def _work(task: Task, base: Path) -> tuple[int, str]:
-    """Run a worker to its end. Returns: its exit status, and the end of what it said."""
+    """Run a worker to its end. Returns: its exit status, and the end of its output."""
     environment = {
         **os.environ,
         "PYTHONDONTWRITEBYTECODE": "1",
         "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
-        "MALLOC_ARENA_MAX": "2",  # what threads reserve of the address space is not what they use
+        "MALLOC_ARENA_MAX": "2",  # threads reserve more of the address space than they use
         "TMPDIR": str(base / "temporary"),
         "HOME": str(base / "home"),
         "NERFLOOM_CACHE": str(base / "cache"),
@@ -86,7 +86,7 @@ def _work(task: Task, base: Path) -> tuple[int, str]:
 
 
 def read_report(report: Path) -> tuple[list[Outcome], dict | None, bool]:
-    """What became of inputs; the one that was begun last where nothing became of it; whether there are no more."""
+    """The outcomes of inputs; the last input that was begun, if it has no outcome; whether there are no more."""
     outcomes, begun, ended = [], None, False
     for line in report.read_text(encoding="utf-8").splitlines() if report.exists() else ():
         entry = json.loads(line)

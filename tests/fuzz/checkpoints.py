@@ -1,4 +1,4 @@
-"""Damage to checkpoints: to the bytes under a seal that fits, to what they say, and code in the place of data."""
+"""Damage to checkpoints: to the bytes under a seal that fits, to their content, and code in the place of data."""
 
 import hashlib
 import io
@@ -26,7 +26,7 @@ VALUES = (*(value for value in PLAIN if value is not DEEP), *TENSORS, (), (1, 2)
 
 
 def sealed(content: bytes) -> bytes:
-    """Content with the seal that fits it, whatever it is."""
+    """Any content with the seal that fits it."""
     return content + SEAL + hashlib.sha256(content).hexdigest().encode()
 
 
@@ -41,7 +41,7 @@ def under_the_seal(random: Random, content: bytes) -> bytes:
 
 
 def other_content(random: Random, content: bytes) -> bytes:
-    """What it says is another, and it is as well written as ever."""
+    """A well-formed file with other values."""
     try:
         found = torch.load(io.BytesIO(content), weights_only=True)
     except Exception:  # damaged before

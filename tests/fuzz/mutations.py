@@ -1,7 +1,7 @@
 """Inputs that no reader should have to accept; a seed reproduces each of them.
 
-What is done to a file depends on what it is: bytes are flipped under a checksum that fits again, counts and sizes are
-what types hold at most, values are of other kinds, names lead elsewhere.
+The damage to a file depends on its kind: bytes are flipped under a checksum that fits again, counts and sizes are the
+maxima of types, values are of other kinds, names lead elsewhere.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,18 +29,18 @@ KINDS: dict[str, Sequence[Mutation]] = {
     "png": PICTURE,
     "jpg": PICTURE,
 }
-"""Ending of a file's name to what may happen to it; all else is bytes."""
+"""Ending of a file's name to its kinds of damage; all else is bytes."""
 SHARE_OF_TREES = 0.6
-"""Of the damage to files that hold names and values."""
+"""Share of damage to names and values, in files that hold these."""
 SHARE_OF_FILES = 0.08
-"""Of the damage that is to a whole file: missing, a link, another's content."""
+"""Share of damage to a whole file: missing, a link, another's content."""
 
 LARGEST = 2**25
 """Bytes of a damaged file; the worker may write twice that."""
 
 
 def damaged(seed: str, files: Files, targets: Sequence[str], words: Sequence[str]) -> tuple[Files, list[str]]:
-    """A folder's files with something wrong, and what was done to each.
+    """A folder's files with damage, and its description for each.
 
     Args:
         targets: patterns of the names of files that may be damaged.
@@ -75,7 +75,7 @@ def _other_content(random: Random, ending: str, content: bytes, words: Sequence[
 
 
 def _other_file(random: Random, files: Files, name: str) -> str:
-    """Change what stands under a name, in place; returns what was done."""
+    """Change the file of a name, in place; returns a description."""
     up = "../" * (name.count("/") + 1)
     targets = {
         "itself": name.rpartition("/")[2],

@@ -1,4 +1,4 @@
-"""What became of an input, and what makes two of them alike."""
+"""The outcome of an input, and the likeness of two outcomes."""
 
 import re
 from dataclasses import dataclass
@@ -7,22 +7,22 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one input."""
+    """The outcome of one input."""
 
     reader: str
     seed: int
     kind: Literal["accepted", "refused", "escaped"]
     error: str = ""
-    """The type of what was raised."""
+    """The type of the error."""
     message: str = ""
     damage: tuple[str, ...] = ()
-    """What had been done to each file."""
+    """The damage to each file."""
     trace: str = ""
     """Where an escape came from."""
 
     @property
     def shape(self) -> str:
-        """The message without what differs from input to input: names, values, numbers."""
+        """The message without the parts that differ from input to input: names, values, numbers."""
         text = re.sub(r"'[^']*'|\"[^\"]*\"", "'...'", self.message)
         text = re.sub(r"\S*/\S*", "PATH", text)
         return re.sub(r"[-+]?(\d[\d.,]*(e[-+]?\d+)?|\bnan\b|\binf\b)", "N", text)[:200]

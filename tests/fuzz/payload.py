@@ -1,4 +1,4 @@
-"""What must never happen: code in a file that is run by reading it."""
+"""Code in a file that reading would run: this must never happen."""
 
 PROOF = "proof"
 """The file that it would leave in the current folder."""

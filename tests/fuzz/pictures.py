@@ -15,13 +15,13 @@ from tests.fuzz.raw import RAW
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 SIDES = (0, 1, 2, 3, 80, 4000, 13_000, 100_000, 2**16, 2**31 - 1, 2**32 - 1)
-"""Of an image that has forty pixels on a side at most."""
+"""Claimed sides of an image that has at most forty pixels on a side."""
 Chunk = tuple[bytes, bytes]
 """Its kind of four letters, and its content."""
 
 
 def chunks(content: bytes) -> list[Chunk]:
-    """Those of a PNG, as far as it is one."""
+    """The chunks of a PNG, as far as it is valid."""
     found, start = [], len(SIGNATURE)
     while content.startswith(SIGNATURE) and start + 12 <= len(content):
         (length,) = struct.unpack_from(">I", content, start)
@@ -31,7 +31,7 @@ def chunks(content: bytes) -> list[Chunk]:
 
 
 def joined(parts: list[Chunk]) -> bytes:
-    """A PNG whose lengths and checksums are right."""
+    """A PNG with right lengths and checksums."""
     out = [SIGNATURE]
     for kind, body in parts:
         out += [struct.pack(">I", len(body)), kind, body, struct.pack(">I", zlib.crc32(kind + body))]
@@ -39,7 +39,7 @@ def joined(parts: list[Chunk]) -> bytes:
 
 
 def other_size(random: Random, content: bytes) -> bytes:
-    """Of a PNG: a small file may claim to be 100,000 pixels wide and high."""
+    """Another size of a PNG: a small file may claim to be 100,000 pixels wide and high."""
     parts = chunks(content)
     if not parts or len(parts[0][1]) != 13:
         return content
@@ -50,7 +50,7 @@ def other_size(random: Random, content: bytes) -> bytes:
 
 
 def other_depth(random: Random, content: bytes) -> bytes:
-    """Of a PNG: bits, colours, compression, filter, interlacing."""
+    """Another format of a PNG: bits, colours, compression, filter, interlacing."""
     parts = chunks(content)
     if not parts or len(parts[0][1]) != 13:
         return content
@@ -60,7 +60,7 @@ def other_depth(random: Random, content: bytes) -> bytes:
 
 
 def other_chunks(random: Random, content: bytes) -> bytes:
-    """Of a PNG: some are missing, there twice, in another order, or nobody knows them."""
+    """Other chunks of a PNG: missing, twice, in another order, or unknown ones."""
     parts = chunks(content)
     if not parts:
         return content

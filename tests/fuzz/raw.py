@@ -1,4 +1,4 @@
-"""Damage to bytes, whatever they mean: what disks, networks and careless programs do, and numbers at their ends."""
+"""Damage to bytes of any meaning: as by disks, networks and careless programs, and numbers at their ends."""
 
 import struct
 from random import Random

@@ -1,4 +1,4 @@
-"""What is fuzzed: something that reads a folder of files that nobody has checked."""
+"""The object of fuzzing: a reader of a folder of unchecked files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,13 +7,13 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader, and what it reads."""
+    """A reader, and its files."""
 
     build: Callable[[Path], object]
     """Writes a small valid input into an empty folder."""
     read: Callable[[Path, Path], object]
-    """Reads the folder; may write below a second one. Raises a `NerfloomError` for bad input, and whatever else it
-    raises is an escape; so is `Nonsense`, for input that was taken and makes no sense."""
+    """Reads the folder; may write below a second one. Raises a `NerfloomError` for bad input, and any other error is an
+    escape; so is `Nonsense`, for input that was taken and makes no sense."""
     targets: tuple[str, ...]
     """Patterns of the files that are damaged."""
     words: tuple[str, ...] = ()
@@ -21,10 +21,10 @@ class Reader:
 
 
 class Nonsense(Exception):
-    """What was read cannot be: it should have been refused."""
+    """Values were read that cannot be: they should have been refused."""
 
 
 def require(holds: object, what: str) -> None:
-    """Raises: Nonsense where something does not hold of what was read."""
+    """Raises: Nonsense if a condition does not hold for the values read."""
     if not holds:
         raise Nonsense(what)

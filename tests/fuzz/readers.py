@@ -131,7 +131,7 @@ def write_dnerf(folder: Path) -> None:
 
 
 def write_nerfstudio(folder: Path) -> None:
-    """With all that the format may have."""
+    """Write a data set with all parts that the format may have."""
     applied = [[1, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, -1, 2.0]]
     placed = {"applied_transform": applied, "applied_scale": 2.0, "aabb_scale": 4}
     write_capture(folder, COUNT, camera_model="OPENCV", k1=0.01, ply_file_path="points.ply", **placed)
@@ -427,7 +427,7 @@ def write_recipe(folder: Path) -> None:
 
 
 def read_recipe(folder: Path, scratch: Path) -> None:
-    """Of a comparison."""
+    """Read the recipe of a comparison."""
     plan = plan_of(from_plain(CompareFlags(), read_yaml(folder / "recipe.yml"), "recipe.yml"))
     require(plan.contenders and plan.conditions.budget(), "a comparison of nothing")
 
@@ -465,14 +465,14 @@ def read_checkpoints(folder: Path, scratch: Path) -> None:
 
 @cache
 def _photographs(folder: Path) -> tuple[Run, Dataset]:
-    """What is trained on, for checkpoints to be restored to."""
+    """A run and its data set, for checkpoints to be restored to."""
     shutil.rmtree(folder, ignore_errors=True)
     run = tiny_run("instant-ngp", write_tiny(folder, size=8, counts=(4, 1, 1)), folder, **SMALL)
     return run, load_split(run, "train")
 
 
 def restore(folder: Path, scratch: Path) -> None:
-    """As ns-eval does, and as --resume does."""
+    """Restore a checkpoint as ns-eval does, and as --resume does."""
     trained = load_trained(folder / "run" / "config.yml", device_type="cpu")
     Trainer.of(*_photographs(scratch.parent / "photographs")).restore(load_checkpoint(trained.checkpoint))
 
@@ -641,4 +641,4 @@ READERS: dict[str, Reader] = {
     "pixel-cache": Reader(write_pixel_cache, read_pixel_cache, ("pixels.bin",)),
     "lpips-weights": Reader(write_weights, read_lpips, ("weights.npz",)),
 }
-"""By name."""
+"""Readers by name."""

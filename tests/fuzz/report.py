@@ -1,4 +1,4 @@
-"""What became of many inputs, in lines for people and as plain data."""
+"""Outcomes of many inputs, in lines for people and as plain data."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from typing import Any
 from tests.fuzz.outcome import Outcome
 
 LIBRARIES = ("numpy", "pillow", "imageio", "PyYAML", "pycolmap")
-"""That read files for us, besides torch."""
+"""Libraries that read files for us, besides torch."""
 
 
 def by_reader(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
@@ -21,7 +21,7 @@ def by_reader(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
 
 
 def counts(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Inputs of a reader, what became of them, in how many different ways, and the first and the last seed."""
+    """Numbers of inputs of a reader, of their outcomes and of different ones, and the first and the last seed."""
     kinds, seeds = Counter(outcome.kind for outcome in outcomes), [outcome.seed for outcome in outcomes]
     return {
         "inputs": len(outcomes),
@@ -34,7 +34,7 @@ def counts(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def summary(outcomes: Sequence[Outcome]) -> list[str]:
-    """Lines: how many inputs became what, and each kind of answer once, the most frequent first."""
+    """Lines: numbers of inputs by outcome, and each kind of answer once, the most frequent first."""
     lines = []
     for reader, own in by_reader(outcomes).items():
         shapes = Counter((outcome.error, outcome.shape) for outcome in own if outcome.kind == "refused")
@@ -46,7 +46,7 @@ def summary(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def as_plain(outcomes: Sequence[Outcome], seconds: float) -> dict[str, Any]:
-    """For JSON: counts, the escapes in full, and what it was run with."""
+    """For JSON: counts, the escapes in full, and the versions of libraries."""
     from nerfloom.training.machine import machine  # brings torch
 
     readers = {reader: counts(own) for reader, own in by_reader(outcomes).items()}

@@ -1,4 +1,4 @@
-"""What reading may not do: noted as it happens, by the hooks that Python has for it (PEP 578), and by limits."""
+"""Forbidden actions of reading: recorded by Python's audit hooks (PEP 578), and prevented by limits."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ CHANGING = frozenset(
 
 
 class Watch:
-    """Notes what this process does that it should not, wherever in it; for good, as such hooks cannot be removed.
+    """Records forbidden actions anywhere in this process, for good, as such hooks cannot be removed.
 
     Args:
         allowed: folders that may be written below.

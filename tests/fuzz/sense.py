@@ -1,4 +1,4 @@
-"""What must hold of whatever a reader takes: that it can be computed with."""
+"""Conditions for all values that a reader takes: they can be computed with."""
 
 import math
 
@@ -39,7 +39,7 @@ def check_cameras(cameras: Cameras, near: float, far: float) -> None:
 
 
 def _check_rays(cameras: Cameras, near: float, far: float) -> None:
-    """Those through the corners of every image."""
+    """Check the rays through the corners of every image."""
     count = len(cameras)
     indices = torch.arange(count).repeat(4)
     columns = torch.cat([0 * cameras.widths, cameras.widths - 1] * 2).float()
@@ -48,7 +48,7 @@ def _check_rays(cameras: Cameras, near: float, far: float) -> None:
     _finite("origins of rays", rays.origins)
     _finite("directions of rays", rays.directions)
     off = (rays.directions.norm(dim=-1) - 1).abs().max().item()
-    require(off <= DIRECTION_TOLERANCE, f"directions of rays whose length is off by {off:.2g}")
+    require(off <= DIRECTION_TOLERANCE, f"directions of rays with a length that is off by {off:.2g}")
     if rays.pixel_radii is not None:
         _finite("radii of pixels", rays.pixel_radii)
 

@@ -1,4 +1,4 @@
-"""The fuzzing itself: it finds readers that misbehave, and whatever it finds, a seed finds again."""
+"""The fuzzing itself: it finds readers that misbehave, and a seed reproduces every finding."""
 
 import json
 import math
@@ -35,7 +35,7 @@ FOUND = {
     "abort": "SIGABRT",
     "read_what_is_not_there": "SIGSEGV",
 }
-"""What each of the broken readers is found by."""
+"""The finding for each of the broken readers."""
 
 
 @pytest.fixture(scope="module")

@@ -49,4 +49,4 @@ def test_damaged_files_are_refused_in_a_line_or_read_with_sense(
     escapes = [str(outcome) for outcome in outcomes if outcome.kind == "escaped"]
     assert not escapes, "\n\n".join([f"{len(escapes)} of {len(outcomes)} inputs got through:", *escapes[:5]])
     refused = sum(outcome.kind == "refused" for outcome in outcomes) / len(outcomes)
-    assert 0.2 < refused < 0.98, f"{refused:.0%} were refused: does the damage reach what is read?"
+    assert 0.2 < refused < 0.98, f"{refused:.0%} were refused: does the damage reach the bytes that are read?"

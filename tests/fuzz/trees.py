@@ -1,4 +1,4 @@
-"""Damage to what names and values say, the file being as well-formed as ever: JSON, YAML, and what checkpoints hold."""
+"""Damage to names and values in well-formed files: JSON, YAML, and the content of checkpoints."""
 
 import copy
 import json
@@ -125,7 +125,7 @@ def other_magnitude(random: Random, tree: Any, words: Sequence[str], values: Seq
 
 
 def _inner(tree: Any) -> list[Where]:
-    """The ways to what holds something."""
+    """The paths to values that contain others."""
     return [where for where in places(tree) if isinstance(at(tree, where), (dict, list))] or [()]
 
 
@@ -136,7 +136,7 @@ TREE = (
 
 
 def damaged_tree(random: Random, tree: Any, words: Sequence[str], values: Sequence[Any] = PLAIN) -> tuple[Any, str]:
-    """A tree with something wrong, and what was done."""
+    """A tree with damage, and its description."""
     change = random.choice(TREE)
     return change(random, tree, words, values), change.__name__
 
@@ -155,7 +155,7 @@ def damaged_yaml(random: Random, content: bytes, words: Sequence[str]) -> tuple[
     if random.random() < 0.3:
         return _with_piece(random, content.decode("utf-8", "replace")), "piece"
     try:
-        if b"&" in content:  # what stands for more than memory holds must not be unfolded here either
+        if b"&" in content:  # values that would fill the memory must not be unpacked here either
             raise ValueError
         tree, what = damaged_tree(random, yaml.safe_load(content), words)
         text = yaml.safe_dump(tree, sort_keys=False, allow_unicode=random.random() < 0.5)

@@ -1,6 +1,6 @@
-"""The process that reads damaged inputs, one after the other, and writes down what becomes of each as it goes.
+"""The process that reads damaged inputs, one after the other, and writes down the outcome of each.
 
-It is one that may die: what it was at is then the last thing it wrote down (`campaign`).
+It may die: its last line then names the input (`campaign`).
 """
 
 import importlib
@@ -26,7 +26,7 @@ from tests.fuzz.sandbox import Watch, limit_files, limit_memory, within
 
 @dataclass(frozen=True)
 class Task:
-    """What a worker is told."""
+    """The task of a worker."""
 
     module: str
     """Has `READERS`."""
@@ -41,11 +41,11 @@ class Task:
     stop: int | None
     """The first that is not read any more."""
     seconds: float | None
-    """After which no further input is begun."""
+    """Seconds until the last input may begin."""
     patience: float = 20.0
     """Seconds for an input."""
     memory: int = 2**31
-    """Bytes that may be taken beyond those taken by reading what is not damaged."""
+    """Maximum memory beyond the memory for undamaged input, bytes."""
     file_size: int = 2**26
     """Bytes of a file."""
 
@@ -69,7 +69,7 @@ class Place:
         write_files(self.data, files)
 
     def untouched(self) -> tuple[Files, list[str]]:
-        """What must be the same afterwards."""
+        """The files that must be the same afterwards."""
         return read_files(self.outside), sorted(os.listdir(self.here))
 
 
@@ -124,7 +124,7 @@ def work(task: Task, report: TextIO) -> None:
     base, place = Path(task.base), Place(Path(task.base))
     watch = Watch([place.scratch, place.temporary])
     pristine = {name: built(readers[name], base / "pristine" / name) for name in task.readers}
-    for name in task.readers:  # what is not damaged is taken; and what is loaded late is loaded now
+    for name in task.readers:  # undamaged input is taken; and late imports happen now
         place.fill(pristine[name])
         readers[name].read(place.data, place.scratch)
     limit_memory(task.memory)

@@ -45,7 +45,7 @@ CPU = {"machine.device_type": "cpu"}
 
 @dataclasses.dataclass(frozen=True)
 class Cameras:
-    """What of nerfbaselines' cameras is used (`GenericCamerasImpl` in its nerfbaselines/_types.py)."""
+    """The used part of nerfbaselines' cameras (`GenericCamerasImpl` in its nerfbaselines/_types.py)."""
 
     poses: np.ndarray
     intrinsics: np.ndarray
@@ -70,7 +70,7 @@ class Cameras:
 
 
 def cameras(poses: np.ndarray, size: int, **changes: Any) -> Cameras:
-    """Pinhole cameras of square pictures, poses with OpenCV's axes; the field of view is that of `ball_view`."""
+    """Pinhole cameras of square pictures, poses with OpenCV's axes; the field of view is `ball_view`'s."""
     count, focal = len(poses), 0.5 * size / math.tan(0.35)
     values: dict[str, Any] = {
         "intrinsics": np.tile(np.array([focal, focal, size / 2, size / 2], np.float32), (count, 1)),

@@ -40,7 +40,7 @@ def learner(name: str, **changes: Any) -> Learner:
 
 @pytest.mark.medium
 def test_velocities_are_those_of_the_ball_and_make_pictures_sharper() -> None:
-    """The mean velocity of what is seen, against the path of the ball; the error, against Gaussians that stay."""
+    """The mean velocity of visible Gaussians is compared with the path of the ball; the error, with still Gaussians."""
     moving, still = learner("drift", rate_factor=8.0), learner("gaussian-splatting", rate_factor=8.0)
     for _ in range(200):
         moving.step()
@@ -56,7 +56,7 @@ def test_velocities_are_those_of_the_ball_and_make_pictures_sharper() -> None:
 
 
 def test_all_columns_go_through_growth_moves_and_checkpoints() -> None:
-    """Each row keeps its values of all columns together, whatever becomes of the others."""
+    """Each row keeps its values of all columns together, with any changes of other rows."""
     for strategy in ("adc", "mcmc", "relocation"):
         found = learner("drift", strategy=strategy, steps_per_reset=10**6)
         model: GaussianModel[Any] = found.model  # type: ignore[assignment]
@@ -119,7 +119,7 @@ class Discs(GaussianSplatting):
 
 
 def test_another_projection_draws_every_picture() -> None:
-    """Those that are trained on, evaluated, and drawn again and again."""
+    """These are pictures in training, in evaluation, and drawn repeatedly."""
     model = Discs(METHOD.decided(dataclasses.replace(METHOD.config, **FEW), SCENE)[0], SCENE)
     round_one = ball(log_scales=torch.full((1, 3), -1.5), harmonics=torch.zeros(1, 3, 15))
     turn = torch.tensor([[0.9, 0.4, 0.1, 0.0]])

@@ -79,7 +79,7 @@ def test_each_is_trained_evaluated_and_rendered_by_the_commands(
 @pytest.mark.medium
 @pytest.mark.parametrize("name", METHODS)
 def test_each_keeps_what_every_method_must(name: str) -> None:
-    """As far as it goes for its kind: the checks of rays are left out where none is cast."""
+    """The checks suit its kind: checks of rays are left out if none is cast."""
     method = load_method(name)
     findings = check_method(method, name, dataclasses.replace(method.config, **SMALL[name]))
     failed = [finding.line() for finding in findings if not finding.ok]
@@ -89,7 +89,7 @@ def test_each_keeps_what_every_method_must(name: str) -> None:
 
 @pytest.mark.medium
 def test_an_output_of_ones_own_is_shown_wherever_pictures_are(trained: Callable[[str], Path], tmp_path: Path) -> None:
-    """In the files of an evaluation, in a video beside the colours, in the viewer's list, and in Python."""
+    """It is in the files of an evaluation, in a video beside the colours, in the viewer's list, and in Python."""
     folder = trained("doubtful")
     (shown, *_) = sorted((folder / "pictures").glob("*_uncertainty.png"))
     assert np.ptp(imageio.imread(shown)) > 50  # it differs between matter and nothing

@@ -1,4 +1,4 @@
-"""A plugin written for the old interface is refused with one line that says what to change."""
+"""A plugin written for the old interface is refused with one line that refers to the needed change."""
 
 from pathlib import Path
 

@@ -67,7 +67,7 @@ def test_fog_hides_by_distance() -> None:
 
 @pytest.mark.medium
 def test_a_data_format_alone(tmp_path: Path) -> None:
-    """Images of a ball from a circle, found by their names, teach instant-ngp what the ball looks like."""
+    """Images of a ball from a circle, found by their names, teach instant-ngp the ball."""
     angles = torch.arange(0, 360, 30)
     around = torch.stack([torch.cos(angles.deg2rad()), torch.sin(angles.deg2rad()), 0 * angles], -1)
     dataset = ball_dataset(4 * around, 40.0)

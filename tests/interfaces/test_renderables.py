@@ -48,7 +48,7 @@ def test_it_is_at_most_80_lines() -> None:
 
 @pytest.mark.medium
 def test_two_runs_side_by_side_are_evaluated(both: nerfloom.Loaded, runs: list[nerfloom.Loaded]) -> None:
-    """The error of an image is that of its halves, and its PSNR that of the error."""
+    """The error of an image is its halves' error, and its PSNR follows from the error."""
     data, squares = both.dataset("test"), []
     for index in range(len(data)):
         target = composite(data.image(index).float() / 255, both.model.background)
@@ -66,7 +66,7 @@ def test_two_runs_side_by_side_are_evaluated(both: nerfloom.Loaded, runs: list[n
 def test_it_is_rendered_by_the_command(
     both: nerfloom.Loaded, runs: list[nerfloom.Loaded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each half of each frame is that of its run."""
+    """Each half of each frame equals its run's."""
 
     def frames(loaded: nerfloom.Loaded, name: str) -> np.ndarray:
         monkeypatch.setattr(loading, "load", lambda *_, **__: loaded)

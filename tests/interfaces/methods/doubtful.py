@@ -24,7 +24,7 @@ class DoubtfulConfig(instant_ngp.InstantNGPConfig):
     """Settings of doubtful."""
 
     least_uncertainty: float = 0.1
-    """Uncertainty below which no ray is trusted."""
+    """Minimum uncertainty of a ray."""
 
 
 class DoubtfulRenderer(VolumeRenderer):

@@ -11,9 +11,9 @@ from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.table import Column
 
 FASTER = 20.0
-"""Learning rate of velocities, in that of centres: a Gaussian may cross the scene."""
+"""Learning rate of velocities, relative to the rate of centres: a Gaussian may cross the scene."""
 REST = 0.5
-"""Time at which Gaussians are where their columns say."""
+"""Time when Gaussians are where their columns say."""
 
 
 class Drift(GaussianSplatting, LearnsMotion):

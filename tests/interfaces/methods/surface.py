@@ -19,7 +19,7 @@ class SurfaceConfig(SamplingConfig, max_num_iterations=2_000, samples_per_batch=
     """Settings of surface."""
 
     sharpness: float = 20.0
-    """First inverse of the width over which a surface turns opaque, 1/length."""
+    """First inverse width of the transition to opaque at a surface, 1/length."""
 
 
 class SurfaceField(Field):

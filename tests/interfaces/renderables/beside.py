@@ -9,11 +9,11 @@ from nerfloom import Picture, Renderable, View
 
 
 class Beside(Renderable):
-    """Two things to look at, side by side.
+    """Two renderables side by side.
 
     Args:
-        left: what is on the left; its frame is taken.
-        right: what is on the right, in the same frame.
+        left: the one on the left; its frame is taken.
+        right: the one on the right, in the same frame.
     """
 
     def __init__(self, left: Renderable, right: Renderable) -> None:

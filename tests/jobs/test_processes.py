@@ -1,4 +1,4 @@
-"""Jobs as processes of this machine: order, failures, interruptions, and what is kept."""
+"""Jobs as processes of this machine: order, failures, interruptions, and kept files."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""Jobs by Slurm: the script does, task by task, what processes do."""
+"""Jobs by Slurm: the script runs the same tasks as processes."""
 
 import os
 import re

@@ -21,7 +21,7 @@ from tests.mutants import all_mutants
 from tests.mutants.mutant import ROOT, Mutant, NotPlantable, Planter, source_of
 
 PATIENCE = 300
-"""Seconds after which a test is ended, for a mutant may be an endless loop, and counts as failed."""
+"""Maximum seconds of a test, because a mutant may be an endless loop; then it counts as failed."""
 PYTEST = ("-q", "-x", "--tb=short", "-p", "no:xdist", "-p", "no:cacheprovider", "--hypothesis-seed=0")
 PRELOADED = (
     "torch",
@@ -39,11 +39,11 @@ PASSED, FAILED, UNPLANTABLE = 0, 1, 100
 
 @dataclass(frozen=True)
 class Tried:
-    """What became of a mutant, or of all tests without one."""
+    """The result for a mutant, or for all tests without one."""
 
     mutant: Mutant | None
     status: int
-    """Of the process; less than 0 is the number of the signal that ended it."""
+    """Exit status of the process; less than 0 is the number of the signal that ended it."""
     said: str
 
     @property
@@ -138,7 +138,7 @@ def _become(mutant: Mutant | None, tests: list[str], log: int) -> NoReturn:
 
 
 def preload() -> None:
-    """Import what tests need besides the package, from the repository's root."""
+    """Import the packages that tests need besides this one, from the repository's root."""
     os.chdir(ROOT)
     os.environ["OMP_WAIT_POLICY"] = "PASSIVE"  # read when torch loads (tests/conftest.py)
     for name in PRELOADED:

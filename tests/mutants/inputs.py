@@ -1,4 +1,4 @@
-"""What is read: data formats, images, masks, processing, downloads."""
+"""Mutants of input: data formats, images, masks, processing, downloads."""
 
 from tests.mutants.mutant import Mutant
 

@@ -1,7 +1,7 @@
 """A mutant: the package with one expression or statement changed, and the test that must fail for it.
 
 A change is a rule on the syntax tree, such as ``A.clamp(min=0)`` to ``A``: a single capital letter stands for any
-expression, the same letter for the same one. So neither layout nor the names of what a letter stands for matter. It is
+expression, the same letter for the same one. So neither layout nor the names behind a letter matter. It is
 planted while the module is imported; no file is written.
 """
 
@@ -39,9 +39,9 @@ class Mutant:
     old: str
     """An expression or a statement. It must match once."""
     new: str
-    """What stands in its place; a letter is what it stood for in `old`."""
+    """The replacement; a letter stands for the same expression as in `old`."""
     means: str
-    """What a user would get."""
+    """The effect for a user."""
     test: str
     """The test that must fail: its path in tests/, ``::``, and its name."""
     module: str = ""
@@ -57,7 +57,7 @@ class Mutant:
         return ast.fix_missing_locations(_Replaced(*self.change(tree)).visit(tree))
 
     def change(self, tree: ast.Module) -> tuple[ast.AST, ast.AST]:
-        """Return the node of the module's syntax tree that is exchanged, and what stands in its place.
+        """Return the node of the module's syntax tree that is exchanged, and its replacement.
 
         Raises: NotPlantable.
         """
@@ -162,14 +162,14 @@ def _named(tree: ast.AST, name: str) -> Iterator[ast.AST]:
 
 
 def _preorder(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes in the order of the source, an outer one before what is in it."""
+    """All nodes in the order of the source, an outer one before its inner ones."""
     yield node
     for child in ast.iter_child_nodes(node):
         yield from _preorder(child)
 
 
 def _matches(pattern: Any, node: Any, bound: dict[str, ast.expr]) -> bool:
-    """Whether a node is what a pattern says; what its letters stand for is added to `bound`."""
+    """Whether a node matches a pattern; the expressions of its letters are added to `bound`."""
     if isinstance(pattern, list):
         alike = isinstance(node, list) and len(pattern) == len(node)
         return alike and all(_matches(*pair, bound) for pair in zip(pattern, node, strict=True))
@@ -185,7 +185,7 @@ def _matches(pattern: Any, node: Any, bound: dict[str, ast.expr]) -> bool:
 
 
 class _Filled(ast.NodeTransformer):
-    """Puts in what letters stand for."""
+    """Replaces letters by their expressions."""
 
     def __init__(self, bound: dict[str, ast.expr]) -> None:
         self.bound = bound

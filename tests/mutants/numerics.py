@@ -1,4 +1,4 @@
-"""What is computed: cameras, rays, samples, fields, pixels, Gaussians."""
+"""Mutants of numerics: cameras, rays, samples, fields, pixels, Gaussians."""
 
 from tests.mutants.mutant import Mutant
 

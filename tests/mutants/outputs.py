@@ -1,4 +1,4 @@
-"""What comes out: evaluation, comparison, exports, commands."""
+"""Mutants of output: evaluation, comparison, exports, commands."""
 
 from tests.mutants.mutant import Mutant
 

@@ -1,4 +1,4 @@
-"""What is learnt: methods, settings, steps, checkpoints."""
+"""Mutants of training: methods, settings, steps, checkpoints."""
 
 from tests.mutants.mutant import Mutant
 

@@ -1,4 +1,4 @@
-"""Octrees about which everything is known."""
+"""Fully known octrees."""
 
 from dataclasses import replace
 

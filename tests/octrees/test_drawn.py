@@ -60,7 +60,7 @@ def test_density_is_that_of_the_leaf() -> None:
 
 
 def test_density_in_boxes_around_one_another() -> None:
-    """Each leaf's depth is that of its own edge."""
+    """Each leaf's depth belongs to its own edge."""
     octree = boxes()
     layout, model = octree.layout, DrawnOctree(octree, octree.scene)
     edges = torch.repeat_interleave(

@@ -1,4 +1,4 @@
-"""Files of octrees: what is written is read, bytes lose what they may, and a hostile file is refused in one line."""
+"""Files of octrees: written files are read, bytes lose no more than allowed, and hostile files are refused."""
 
 import zipfile
 from pathlib import Path

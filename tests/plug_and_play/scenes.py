@@ -1,4 +1,4 @@
-"""Scenes as plain functions of positions, and the plain quadrature of what is seen."""
+"""Scenes as plain functions of positions, and a plain quadrature of their colours."""
 
 from collections.abc import Callable
 
@@ -33,7 +33,7 @@ def steps_through_box(rays: Rays, step: float) -> tuple[Tensor, Tensor]:
 
 
 def dense_quadrature(rays: Rays, rgb_sigma: Callable, step: float) -> Tensor:
-    """(R, 3) float64 over `BACKGROUND`: every step through the box, by the product of what each lets through."""
+    """(R, 3) float64 over `BACKGROUND`: every step through the box, by the product of the transmittances."""
     t, inside = steps_through_box(rays, step)
     positions = rays.origins.double()[:, None] + t[..., None] * rays.directions.double()[:, None]
     directions = rays.directions.double()[:, None].expand_as(positions)

@@ -29,13 +29,13 @@ def loaded(file: Path) -> ModuleType:
 
 
 def differences() -> list[str]:
-    """The lines that go, with "-", and those that come, with "+"."""
+    """The removed lines, with "-", and the added ones, with "+"."""
     lines = [file.read_text().splitlines() for file in (PLAIN, SKIPPING)]
     return [line for line in difflib.ndiff(*lines) if line[0] in "+-"]
 
 
 def test_some_ten_lines_lie_between_them() -> None:
-    """Of those that come, which are what somebody has to write; what goes is compositing that is not needed."""
+    """The added lines are the work of a user; the removed lines are compositing that is not needed."""
     come = [line for line in differences() if line[0] == "+"]
     go = [line for line in differences() if line[0] == "-"]
     print(f"{len(come)} lines come, {len(go)} go")

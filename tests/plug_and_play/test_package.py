@@ -1,4 +1,4 @@
-"""`import nerfloom` costs nothing, and everything in it says what it is."""
+"""`import nerfloom` costs nothing, and everything in it has a docstring."""
 
 import inspect
 import subprocess
@@ -36,7 +36,7 @@ def test_every_name_is_found_and_documented() -> None:
 
 
 def test_type_checkers_see_the_same_names() -> None:
-    """What stands under TYPE_CHECKING is the table of `__getattr__`."""
+    """The names under TYPE_CHECKING equal the table of `__getattr__`."""
     source = inspect.getsource(nerfloom)
     for name, home in nerfloom._HOMES.items():
         assert f"    from nerfloom.{home} import {name} as {name}\n" in source

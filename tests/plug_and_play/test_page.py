@@ -1,4 +1,4 @@
-"""docs/plug-and-play.md is true: its code runs, in the order of the page, and does what the page says."""
+"""docs/plug-and-play.md is true: its code runs, in the order of the page, with the described results."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""`nerfloom.render`: what a user's functions return, composited; values and gradients."""
+"""`nerfloom.render`: the results of a user's functions, composited; values and gradients."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ def rays_for(samples: Samples) -> nerfloom.Rays:
 
 
 def by_hand(samples: Samples, alpha: Tensor, values: Tensor, behind: Tensor) -> Tensor:
-    """(R, C) sums of values (N, C) under the products of what each sample lets through, over `behind` (C,)."""
+    """(R, C) sums of values (N, C) under the products of the samples' transmittances, over `behind` (C,)."""
     rows, start = [], 0
     for count in samples.counts.tolist():
         left, row = alpha.new_ones(()), values.new_zeros(values.shape[1])
@@ -79,7 +79,7 @@ def test_values_are_those_of_the_product_formula(case, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["sigma", "alpha"])
 def test_gradients_are_those_of_finite_differences(case, kind: str) -> None:
-    """Of density or alpha, of colours and of a further property, in float64."""
+    """The gradients by density or alpha, colours and a further property are compared, in float64."""
     rays, samples, sigma, rgb, background = case
     values = sigma if kind == "sigma" else (0.05 + 0.9 * sigma / sigma.max())
     extra = torch.randn(len(samples), 2, dtype=F64)
@@ -95,7 +95,7 @@ def test_gradients_are_those_of_finite_differences(case, kind: str) -> None:
 
 
 def test_the_compiled_kernel_gives_the_same_gradients(case) -> None:
-    """float32, which is what a loop runs in, against float64."""
+    """float32, the type of a training loop, is compared with float64."""
 
     def gradients(dtype: torch.dtype) -> list[Tensor]:
         rays, samples, sigma, rgb, background = case
@@ -133,7 +133,7 @@ def test_rays_have_the_gradient_of_finite_differences(case) -> None:
 
         return nerfloom.render(nerfloom.Rays(origins, directions), samples, function).rgb
 
-    # Turned about, directions leave the unit sphere by less than what is taken for length 1.
+    # Turned about, directions leave the unit sphere by less than the tolerance for length 1.
     assert torch.autograd.gradcheck(rendered, [rays.origins.requires_grad_(), rays.directions.requires_grad_()])
 
 
@@ -156,7 +156,7 @@ def test_a_sum_under_detached_weights_teaches_the_property_alone(case) -> None:
 
 
 def test_half_precision_is_composited_in_float32() -> None:
-    """As under autocast, where thin samples' optical depth would be lost."""
+    """Autocast is such a case: thin samples' optical depth would be lost."""
     edges = torch.linspace(0, 1, 1001).expand(1, -1)
     samples = Samples.regular(edges[:, :-1], edges[:, 1:])
     rays = nerfloom.Rays(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0]]))

@@ -14,7 +14,7 @@ from tests.plug_and_play.scenes import BACKGROUND, functions
 
 
 def error(rays: nerfloom.Rays, samples: Samples, scene: str | ClosedForm) -> float:
-    """Of colour, root mean square."""
+    """Root mean square error of colour."""
     field = scenes()[scene] if isinstance(scene, str) else scene
     color = nerfloom.render(rays, samples, functions(field)[1], BACKGROUND).rgb
     return (color.double() - field.truth(rays, BACKGROUND).color).square().mean().sqrt().item()

@@ -16,7 +16,7 @@ SCENES = ("fog", "nested", "blobs", "sparse")
 
 @pytest.fixture(params=["kernels", "torch alone"])
 def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """With the compiled kernels, and with the references, as on every other device."""
+    """The compiled kernels, and the references, as on every other device."""
     if request.param == "torch alone":
         monkeypatch.setattr(native, "available", lambda: False)
     return request.param
@@ -40,7 +40,7 @@ def test_it_is_dense_quadrature_within_the_stated_bound(name: str) -> None:
         color, count = picture(rays, name, grid, early_stop)
         error = (color.double() - truth).abs().max().item()
         print(f"{name}, early stop {early_stop}: {count} of {all_steps} samples, colour off by {error:.1e}")
-        # A step whose middle lies within rounding of a jump of density may fall on its other side.
+        # A step with its middle within rounding of a jump of density may fall on the other side.
         rounding = 2e-5 if name in ("fog", "blobs") else 2e-3
         assert error <= early_stop + rounding
         assert abs(count - all_steps) <= len(rays) * 1e-2 if early_stop == 0 else count <= all_steps * 1.01
@@ -48,7 +48,7 @@ def test_it_is_dense_quadrature_within_the_stated_bound(name: str) -> None:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_the_early_stop_keeps_its_bound_exactly(name: str) -> None:
-    """Of the same steps, so that nothing but the stop differs."""
+    """Both have the same steps, so that only the stop differs."""
     rays, grid = random_rays(2000, seed=1), nerfloom.OccupancyGrid(BOX, 32, STEPS)
     grid.fill(functions(name)[0])
     whole, count = picture(rays, name, grid, 0.0)
@@ -64,7 +64,7 @@ def test_the_early_stop_keeps_its_bound_exactly(name: str) -> None:
     ("name", "least", "most"), [("sparse", 0.98, 1e-3), ("blobs", 0.9, 5e-3), ("nested", 0.6, 3e-3)]
 )
 def test_a_grid_that_was_filled_skips_what_is_empty(name: str, least: float, most: float) -> None:
-    """Of all samples at least `least` are left out, and colour is at most `most` (rms) worse than without."""
+    """At least `least` of all samples are left out, and colour is at most `most` (rms) worse than without."""
     torch.manual_seed(0)
     rays, grid = random_rays(2000, seed=2), nerfloom.OccupancyGrid(BOX, 64, STEPS)
     dense = dense_quadrature(rays, functions(name)[1], grid.step_size)
@@ -80,7 +80,7 @@ def test_a_grid_that_was_filled_skips_what_is_empty(name: str, least: float, mos
 
 
 def test_updates_keep_a_grid_up() -> None:
-    """In a training loop, by steps alone: a ball that was learnt is found, and what has moved away is forgotten."""
+    """A training loop has steps alone: a learnt ball is found, and matter that has moved away is forgotten."""
     torch.manual_seed(0)
     grid = nerfloom.OccupancyGrid(BOX, 16, 128)
     assert bool(grid.occupied.all())
@@ -116,7 +116,7 @@ def test_near_and_far_ends_are_those_of_the_box_where_they_are_not_evaluated() -
 
 
 def test_rays_may_be_of_float64() -> None:
-    """The reference marches them; samples are those of float32 but for steps that lie on a face within rounding."""
+    """The reference marches them; samples equal float32's, except for steps that lie on a face within rounding."""
     rays, grid = random_rays(300, seed=7), nerfloom.OccupancyGrid(BOX, 32, 128)
     double = nerfloom.Rays(rays.origins.double(), rays.directions.double())
     grid.fill(functions("nested")[0])

@@ -1,6 +1,6 @@
 """A method of another package, as its users have it: nerfloom's wheel and the example's in an environment of their own.
 
-Dependencies are those of the environment the tests run in, so nothing is downloaded.
+Dependencies come from the tests' environment, so nothing is downloaded.
 """
 
 import json
@@ -51,14 +51,14 @@ class Installed:
         return run([self.folder / BIN / command, *arguments], self.folder)
 
     def train(self, method: str, flags: str, timestamp: str) -> tuple[subprocess.CompletedProcess[str], Path]:
-        """Twenty steps on the embedded scene; what was printed, and the run's folder."""
+        """Train twenty steps on the embedded scene; return the output, and the run's folder."""
         limits = f"--max-num-iterations 20 --max-eval-images 2 --vis none --timestamp {timestamp}"
         words = f"{flags} {limits} --output-dir {self.folder / 'outputs'} procedural {SCENE}".split()
         return self.run("ns-train", method, *words), self.folder / "outputs" / "procedural" / method / timestamp
 
 
 def run(words: list[object], folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a program in a folder, in an environment without what leads astray."""
+    """Run a program in a folder, in an environment without misleading variables."""
     environment = {key: value for key, value in os.environ.items() if key not in LEADS_ASTRAY}
     environment["NERFLOOM_CACHE"] = str(folder / "cache")
     return subprocess.run(
@@ -67,7 +67,7 @@ def run(words: list[object], folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def checked(words: list[object], folder: Path) -> str:
-    """What a program printed that must succeed."""
+    """The output of a program that must succeed."""
     done = run(words, folder)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

@@ -1,4 +1,4 @@
-"""What is in the two distributions: all that is needed, nothing else, and not too much of it."""
+"""Content of the two distributions: all needed files, no others, and within a size."""
 
 import ast
 import re
@@ -50,7 +50,7 @@ def check_wheel(wheel: Path) -> str:
         raise Problem("the wheel lacks the licence")
     libraries = [Path(name) for name in names if name.endswith(LIBRARIES)]
     if not libraries or any(path.parent.as_posix() != "nerfloom/kernels/lib" for path in libraries):
-        raise Problem(f"the wheel's libraries are {libraries}; those of the kernels are expected, and no others")
+        raise Problem(f"the wheel's libraries are {libraries}; only the kernels' libraries are expected")
     kinds = {path.stem for path in libraries}
     if re.search(r"linux.*x86_64", wheel.name) and kinds != set(NEEDS):
         raise Problem(f"the wheel lacks the kernels for {', '.join(sorted(set(NEEDS) - kinds))}: is the compiler old?")
@@ -63,7 +63,7 @@ def check_wheel(wheel: Path) -> str:
 
 
 def check_declared(metadata: Message) -> None:
-    """Check that the metadata is that of pyproject.toml."""
+    """Check that the metadata agrees with pyproject.toml."""
     pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     required = {re.sub(r"\s", "", line) for line in metadata.get_all("Requires-Dist", []) if "extra ==" not in line}
     declared = re.search(r"^dependencies = (\[.*?^\])", pyproject, re.MULTILINE | re.DOTALL)
@@ -71,7 +71,7 @@ def check_declared(metadata: Message) -> None:
     if declared is None or pythons is None:
         raise Problem("pyproject.toml has no dependencies, or no requires-python")
     if required != {re.sub(r"\s", "", line) for line in ast.literal_eval(declared[1])}:
-        raise Problem(f"the wheel requires {sorted(required)}, not what pyproject.toml says")
+        raise Problem(f"the wheel requires {sorted(required)}, unlike pyproject.toml")
     for field, value in (("Version", version()), ("Requires-Python", pythons[1])):
         if metadata[field] != value:
             raise Problem(f"the wheel's {field} is {metadata[field]}, not {value}")

@@ -1,4 +1,4 @@
-"""The two distributions, as `python -m build` makes them, and what twine says of their metadata."""
+"""The two distributions, as `python -m build` makes them, and twine's check of their metadata."""
 
 import os
 import subprocess
@@ -10,11 +10,11 @@ from tests.release.problem import Problem
 from tests.release.sources import ROOT
 
 LEADS_ASTRAY = ("PYTHONPATH", "PYTHONHOME", "PIP_CONSTRAINT", "NERFLOOM_METHODS", "NERFLOOM_DATAPARSERS")
-"""Variables that lead Python or pip to something else than what is checked."""
+"""Variables that lead Python or pip to other files than the checked ones."""
 
 
 def run(words: list[object], folder: Path, **variables: str) -> str:
-    """Run a program in a folder; what it printed. A failure is a problem."""
+    """Run a program in a folder; return its output. A failure is a problem."""
     environment = {name: value for name, value in os.environ.items() if name not in LEADS_ASTRAY} | variables
     done = subprocess.run([str(word) for word in words], cwd=folder, env=environment, capture_output=True, text=True)
     if done.returncode:
@@ -37,6 +37,6 @@ def build(folder: Path) -> tuple[Path, Path]:
 
 
 def check_metadata(sdist: Path, wheel: Path) -> str:
-    """Check what a package index checks: metadata, and that README renders."""
+    """Check metadata and the rendering of README, as a package index does."""
     run([sys.executable, "-m", "twine", "check", "--strict", sdist, wheel], sdist.parent)
     return "twine check --strict: metadata and README's rendering pass, of both"

@@ -1,6 +1,6 @@
 """A distribution installed into an environment of its own, and used there.
 
-Dependencies are those of the environment that runs the check: they are found last on the path, so that nothing is
+Dependencies come from the environment that runs the check: they are found last on the path, so that nothing is
 downloaded, and no other torch gets in.
 """
 
@@ -25,7 +25,7 @@ class Environment:
 
     Args:
         folder: folder of the environment.
-        distribution: what is installed.
+        distribution: file to install.
     """
 
     folder: Path
@@ -36,7 +36,7 @@ class Environment:
         return self.folder / BIN / "python"
 
     def install(self, **variables: str) -> str:
-        """Create the environment and install the distribution; what pip printed."""
+        """Create the environment and install the distribution; return pip's output."""
         venv.EnvBuilder(symlinks=os.name != "nt", clear=True).create(self.folder)
         pip = [sys.executable, "-m", "pip", "--isolated", "--disable-pip-version-check", "--no-cache-dir"]
         words = [*pip, "--python", self.python, "install", "-v", "--no-index", "--no-deps", "--no-build-isolation"]
@@ -61,7 +61,7 @@ class Environment:
         said = run([self.folder / BIN / "ns-train", "--version", "--environment"], self.folder, **NO_COMPILER)
         home = re.search(r"^nerfloom +\S+ from (.+?)(, commit .*)?$", said, re.MULTILINE)
         if home is None or not Path(home[1]).is_relative_to(self.folder):
-            raise Problem(f"not the installed package runs, but that of {home and home[1]}")
+            raise Problem(f"not the installed package runs, but the one of {home and home[1]}")
         found = re.search(r"^kernels +(\w+) on the CPU", said, re.MULTILINE)
         if found is None:
             raise Problem(f"ns-train --version --environment does not say which kernels run:\n{said}")

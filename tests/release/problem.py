@@ -1,5 +1,5 @@
-"""What stands against a release."""
+"""Obstacles to a release."""
 
 
 class Problem(Exception):
-    """Something that must be put right before a release; the message says what."""
+    """Something that must be put right before a release; the message describes it."""

@@ -1,4 +1,4 @@
-"""Checks of the sources, before anything is built: one version, the licence, and what pages about the project need."""
+"""Checks of the sources, before anything is built: one version, the licence, and files for pages about the project."""
 
 import ast
 import re
@@ -21,7 +21,7 @@ def version() -> str:
 
 
 def check_sources() -> list[str]:
-    """Check the files of the checkout; returns what was found to be right."""
+    """Check the files of the checkout; returns the passed checks."""
     current = version()
     if not re.fullmatch(r"\d+\.\d+\.\d+((a|b|rc)\d+)?", current):
         raise Problem(f"the version {current} is not of the form 1.2.3 or 1.2.3rc1")

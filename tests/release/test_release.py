@@ -30,7 +30,7 @@ def metadata(**changed: str) -> str:
 
 
 def write_wheel(folder: Path, left_out: str = "", more: str = "", **changed: str) -> Path:
-    """A wheel as it should be, with empty files, but for what is changed."""
+    """A correct wheel with empty files, except for the changes."""
     path = folder / f"nerfloom-{nerfloom.__version__}-py3-none-linux_x86_64.whl"
     libraries = [f"nerfloom/kernels/lib/{kind}.so" for kind in NEEDS]
     names = [*map(installed, tracked()), f"{INFO}/licenses/LICENSE", f"{INFO}/RECORD", *libraries, more]
@@ -102,7 +102,7 @@ def test_a_wheel_as_it_should_be(tmp_path: Path) -> None:
         ({"more": "tests/test_light.py"}, "holds tests/test_light.py"),
         ({"more": "nerfloom/lego.PNG"}, "holds nerfloom/lego.PNG"),
         ({"more": "framework/__init__.py"}, "holds framework/__init__.py"),
-        ({"more": "nerfloom/other.so"}, "those of the kernels are expected"),
+        ({"more": "nerfloom/other.so"}, "only the kernels' libraries are expected"),
         ({"Version": "9.9"}, "Version is 9.9"),
         ({"Requires-Python": ">=3.8"}, "Requires-Python is >=3.8"),
         ({"Name": "nerfloom\nRequires-Dist: left-pad"}, "requires .*left-pad"),
@@ -140,7 +140,7 @@ def test_a_wheel_for_one_python_is_noticed(tmp_path: Path) -> None:
 
 
 def test_the_checkout_is_not_taken_for_the_installed(tmp_path: Path) -> None:
-    """Where the command that runs is that of another package, the check says so."""
+    """If the command that runs belongs to another package, the check says so."""
     (tmp_path / BIN).mkdir()
     command = tmp_path / BIN / "ns-train"
     command.write_text(f"#!/bin/sh\necho 'nerfloom  1.0 from {ROOT}/framework'\necho 'kernels   avx2 on the CPU'\n")

@@ -1,4 +1,4 @@
-"""The inverted sphere behind a method: what is composited, where the inside ends, and what is decided."""
+"""The inverted sphere behind a method: compositing, the end of the inside, and decisions."""
 
 import dataclasses
 from typing import Any
@@ -115,7 +115,7 @@ def test_fog_inside_and_outside_in_closed_form(endless: bool) -> None:
 
 
 def test_colours_and_depths_are_those_of_all_samples_in_one_row() -> None:
-    """Against one compositing of inner and outer samples together, whose densities and lengths are arbitrary."""
+    """The truth is one compositing of inner and outer samples together, with arbitrary densities and lengths."""
     torch.manual_seed(0)
     count, inner, outer = 30, 6, 5
     rays = Rays(torch.zeros(count, 3).double(), normalize(torch.randn(count, 3).double(), dim=-1))
@@ -161,7 +161,7 @@ def test_each_level_is_behind_its_own() -> None:
 
 
 def test_a_ray_that_ends_inside_sees_nothing_outside() -> None:
-    """As those of a viewer's crop box do."""
+    """Rays of a viewer's crop box do so."""
     rays = dataclasses.replace(rays_of(20), fars=torch.full((20,), 0.05).double())
     rays = dataclasses.replace(rays, origins=SPHERE[:3].expand(20, 3))
     clear, solid = Fog(torch.zeros(()).double()), Fog(torch.full((), 9.0).double())

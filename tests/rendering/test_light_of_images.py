@@ -344,7 +344,7 @@ def test_gains_and_white_balances_are_found_and_the_mean_is_neutral() -> None:
 @pytest.mark.medium
 @pytest.mark.parametrize("stated", [True, False])
 def test_exposures_are_found(stated: bool) -> None:
-    """In stops, where files state them and where they do not."""
+    """Exposures are compared in stops, whether files state them or not."""
     draws = torch.Generator().manual_seed(0)
     truth = 0.05 + 0.5 * torch.rand(150, 3, generator=draws)
     stops = torch.tensor([0.75, -1.0, 0.5, -0.25])
@@ -381,7 +381,7 @@ def test_a_shade_at_a_border_takes_a_grid() -> None:
 
 
 def dimmed(method: str, kind: str, folder: Path, out: Path, factors: Tensor, **settings: object) -> Trainer:
-    """A trainer on the tiny data set, whose photographs are darker by factors (M,)."""
+    """A trainer on the tiny data set with photographs darkened by factors (M,)."""
     still = tiny_trainer(method, folder, out / "still").train_set
     sizes, pixels = still.cameras.widths * still.cameras.heights, still.pixels.clone()
     pixels[:, :3] = (still.pixels[:, :3] * factors.repeat_interleave(sizes)[:, None]).round().to(torch.uint8)
@@ -406,7 +406,7 @@ def test_every_method_has_every_kind(method: str, kind: str, shared_tiny: Path, 
 
 
 def test_rays_of_a_grid_know_their_position_in_the_image(shared_tiny: Path, tmp_path: Path) -> None:
-    """Those of a pixel are around its centre; others do not look for it."""
+    """Rays of a pixel are around its centre; other kinds do not use the position."""
     for kind in ("grid", "affine"):
         (tmp_path / kind).mkdir()
         trainer = dimmed("instant-ngp", kind, shared_tiny, tmp_path / kind, torch.ones(10))

@@ -1,4 +1,4 @@
-"""The volume renderer: what it asks a field, that it asks nothing twice, and density and opacity shown alike."""
+"""The volume renderer: its calls of a field, without repetition, and equal pictures of density and opacity."""
 
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -29,7 +29,7 @@ RAY_METHODS = [name for name in BUILT_IN if name not in ("gaussian-splatting", "
 
 
 class Cloud(Field):
-    """Smooth density around the origin, coloured by where it is; remembers what it was asked."""
+    """Smooth density around the origin, coloured by position; it records its calls."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -169,7 +169,7 @@ class Listed(Cloud):
 
 
 def test_gradients_are_scaled_near_cameras_in_training_and_values_are_not() -> None:
-    """By the squared distance in units of `unit_length`, and not at all beyond it."""
+    """The factor is the squared distance in units of `unit_length`, and 1 beyond it."""
     rays = some_rays(5, near=0.0, far=4.0)
     samples = UniformSampler(8).sample(rays, Cloud(), False)
     outcome = {}

@@ -83,7 +83,7 @@ def test_nearest_is_that_of_a_place_outside_both_balls(sizes: tuple[float, float
 @pytest.mark.parametrize("beta", [0.1, 0.01, 0.002])
 @pytest.mark.parametrize("name", SCENES)
 def test_opacity_is_within_its_bound(name: str, beta: float) -> None:
-    """At random places, dense and sparse ones; and the bound says something where samples are dense."""
+    """Places are random, dense and sparse ones; the bound is tight where samples are dense."""
     some, width = rays(), torch.tensor(beta, dtype=torch.float64)
     for count in (16, 2000):
         t = torch.rand(len(some), count, dtype=torch.float64).sort(dim=-1).values * 3 + 0.5

@@ -115,7 +115,7 @@ def test_the_first_of_two_thin_sheets_is_met() -> None:
     truth = (near - rays.origins[:, 2]) / rise
     truth = torch.where((truth > 0) & (truth < 5.9), truth, torch.inf)
     t = traced(sheets, rays, whole(rays, end=5.9))
-    inner = ~((truth - 5.9).abs() < 2 * SHORTEST)  # what begins there may be thinner than the shortest advance
+    inner = ~((truth - 5.9).abs() < 2 * SHORTEST)  # matter that begins there may be thinner than the shortest advance
     assert torch.equal(t.isfinite()[inner], truth.isfinite()[inner])
     assert (t - truth)[t.isfinite() & truth.isfinite()].abs().max() < 1e-6
 
@@ -129,7 +129,7 @@ def test_a_ray_that_starts_inside_has_to_leave_first() -> None:
     rays = Rays(torch.tensor([[0.1, 0, 0.2]]).double(), torch.tensor([[0.0, 0, 1]]).double())
     assert traced(two, rays).item() == pytest.approx(4 - 0.2 - (1 - 0.01) ** 0.5, abs=1e-6)
     assert traced(ball, rays).item() == torch.inf
-    cut = whole(rays, 0.5, 6.0)  # a box whose face cuts through the ball: space before it is outside
+    cut = whole(rays, 0.5, 6.0)  # a face of the box cuts through the ball: space before it is outside
     assert traced(ball, rays, cut).item() == 0.5
 
 
@@ -149,7 +149,7 @@ def test_only_the_pieces_are_searched() -> None:
 
 
 def test_a_distance_that_is_too_long_is_led_back() -> None:
-    """By 15 %: rays pass the surface and are inside."""
+    """The distance is 15 % too long: rays pass the surface and are inside."""
     rays = random_rays()
     truth = ball_truth(rays)
     deep = truth.isfinite() & (ball(rays.points(torch.arange(len(rays)), truth + 0.3)) < -0.1)
@@ -164,7 +164,7 @@ def test_a_broken_distance_shows() -> None:
 
 
 def test_edges_cover_the_share_of_a_pixel_that_they_hide() -> None:
-    """Of a ball: against rays at random places in square pixels, whose cone has the pixel's variance."""
+    """Edges of a ball are compared with rays at random places in square pixels; the cone has the pixel's variance."""
     torch.manual_seed(0)
     width, offsets = 0.02, torch.linspace(0.97, 1.03, 31, dtype=torch.float64)
     turn = torch.rand(31, dtype=torch.float64) * 2 * torch.pi

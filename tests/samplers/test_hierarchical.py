@@ -17,7 +17,7 @@ COARSE, FINE = 16, 48
 
 
 class Slab(Field):
-    """Density between two planes across x, a parameter; remembers what it was asked."""
+    """Density between two planes across x, a parameter; it records its calls."""
 
     def __init__(self, low: float, high: float, sigma: float) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Unasked(Field):
 
 
 def rays_along_x(count: int, times: Tensor | None = None) -> Rays:
-    """From x = 0 to 8, a bin being half a unit; then x is t."""
+    """Rays from x = 0 to 8 with bins of half a unit, so that x is t."""
     torch.manual_seed(0)
     origins = torch.cat([torch.zeros(count, 1), torch.rand(count, 2)], dim=-1)
     directions = torch.eye(3)[:1].expand(count, 3)
@@ -58,7 +58,7 @@ def coarse_of(samples: Samples) -> CoarseLevel:
 
 
 def drawn_of(samples: Samples) -> Tensor:
-    """Those of the samples (R, FINE) that are not the coarse level's."""
+    """The samples (R, FINE) that are not the coarse level's."""
     t, stratified = samples.padded(samples.t), coarse_of(samples).samples
     both = torch.cat([stratified.padded(stratified.t), t], dim=-1).sort(dim=-1).values
     repeated = both[:, 1:] == both[:, :-1]
@@ -70,7 +70,7 @@ def drawn_of(samples: Samples) -> Tensor:
 @pytest.mark.parametrize("jitter", [True, False])
 @pytest.mark.parametrize("count", [0, 7])
 def test_samples_are_the_stratified_and_the_drawn_ones_sorted(count: int, jitter: bool) -> None:
-    """As points of NeRF's quadrature: the interval of each ends where the next is, that of the last nowhere."""
+    """They are points of NeRF's quadrature: the interval of each ends at the next, the last one nowhere."""
     sampler = HierarchicalSampler(Slab(2.0, 3.0, 5.0), COARSE, FINE)
     rays = rays_along_x(count)
     torch.manual_seed(3)
@@ -101,7 +101,7 @@ def test_samples_are_drawn_where_the_coarse_field_is_dense(jitter: bool) -> None
 
 
 def test_samples_are_drawn_by_the_weights_of_the_stratified_ones() -> None:
-    """Behind half-transparent matter fewer: by hand, from t = 1.25 every half unit, of what each interval stops."""
+    """Fewer are behind half-transparent matter: by hand, every half unit from t = 1.25, by the intervals' weights."""
     samples = HierarchicalSampler(Slab(1.0, 3.0, 1.2), COARSE, 4096).sample(rays_along_x(1), Unasked(), False)
     t = samples.t
     stop = 1 - torch.exp(torch.tensor(-1.2 * 0.5)).item()
@@ -125,7 +125,7 @@ def test_where_nothing_is_found_samples_are_drawn_evenly(jitter: bool) -> None:
 
 
 def test_the_coarse_field_is_asked_once_for_all_that_it_is_shown_by() -> None:
-    """With times and its footprint; density has a gradient, and the positions that are drawn by it have none."""
+    """It gets times and its footprint; density has a gradient, and the positions drawn by it have none."""
     coarse = Slab(2.0, 3.0, 5.0)
     coarse.footprint = "radius"  # type: ignore[misc]
     rays = rays_along_x(3, times=torch.tensor([0.1, 0.2, 0.3]))
@@ -211,7 +211,7 @@ def test_intervals_divide_the_ray_and_the_field_is_its_own_coarse_level(count: i
 
 
 def test_intervals_are_drawn_by_blurred_weights() -> None:
-    """By hand: a wall in the bin [4, 4.5] alone; half of its weight on each neighbour, and 0.01 for every bin."""
+    """By hand, a wall is in the bin [4, 4.5]; half of its weight is on each neighbour, and 0.01 in every bin."""
     samples = HierarchicalSampler(None, COARSE, 4095).sample(rays_along_x(1), Slab(4.0, 4.5, 1e3), False)
     expected = torch.full((COARSE,), 0.01)
     expected[7:10] += torch.tensor([0.5, 1.0, 0.5])

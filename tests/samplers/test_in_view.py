@@ -104,7 +104,7 @@ def test_a_picture_is_the_same_with_rays_through_every_pixel(
     scene, method = Scene(BOX, 0.5, 20.0, 3, True, False, 200), load_method("instant-ngp")
     config, _ = method.decided(dataclasses.replace(method.config, eval_num_rays_per_chunk=5000), scene)
     model = RayModel(config, scene, Cloud(), sampler(), VolumeRenderer())
-    model.register_parameter("any", torch.nn.Parameter(torch.zeros(1)))  # a model's device is that of its parameters
+    model.register_parameter("any", torch.nn.Parameter(torch.zeros(1)))  # a model's device is its parameters'
     monkeypatch.setattr("nerfloom.samplers.in_view.MIN_PIXELS", 1)
     view, cast = View(camera((4.0, 1.0, 0.5)), rays_per_pixel=per_pixel, stride=stride), []  # type: ignore[arg-type]
     render = RayModel.render

@@ -26,7 +26,7 @@ def test_a_million_draws_follow_the_density() -> None:
 
 
 def test_even_spacing_reproduces_quantiles() -> None:
-    """With one bin per weight, the k-th of S evenly spaced samples is the (k + 0.5) / S quantile."""
+    """The k-th of S evenly spaced samples is the (k + 0.5) / S quantile, with one bin per weight."""
     u = uniform_variates(1, 8, False, torch.device("cpu")).double()
     drawn = inverse_cdf(torch.tensor([[0.0, 1.0, 3.0]]).double(), torch.tensor([[1.0, 1.0]]).double(), u, 0.0)
     expected = [0.125, 0.375, 0.625, 0.875, 1.25, 1.75, 2.25, 2.75]

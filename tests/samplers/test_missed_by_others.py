@@ -1,4 +1,4 @@
-"""What planted bugs showed that no other test holds: how cells fade, when they are full, what unit disparity has."""
+"""Behaviour that only planted bugs showed to be untested: fading of cells, full cells, the unit of disparity."""
 
 import pytest
 import torch
@@ -19,7 +19,7 @@ def nothing(points: Points) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize(("moving", "decay"), [(False, DECAY), (True, MOVING_DECAY)])
 def test_a_cell_fades_slower_where_something_moves(moving: bool, decay: float) -> None:
-    """By hand: a cell that was full and is seen empty keeps `decay` of its density; others keep all of it."""
+    """The truth is by hand: a full cell that is seen empty keeps `decay` of its density; others keep all of it."""
     sampler = OccupancySampler(BOX, resolution=8, moving=moving)
     sampler.density_grid.fill_(1.0)
     sampler.update(WARM_UP_STEPS + 16, nothing)
@@ -34,7 +34,7 @@ def late(points: Points) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_cell_of_a_scene_that_moves_is_full_if_it_is_at_any_time(moving: bool) -> None:
-    """Of a grid that is made for a scene: one that stands still is not asked for its times."""
+    """The grid is made for a scene: a still one is not asked for its times."""
     scene = Scene(BOX, 0.0, 10.0, 3, True, moving, 20, num_times=3 * moving)
     sampler = make_sampler(SamplingConfig(sampler="occupancy", grid_resolution=8), scene)
     assert isinstance(sampler, OccupancySampler)

@@ -29,7 +29,7 @@ CAPTURE = Scene(BOX, 0.05, 1000.0, 3, has_alpha=False, moving=False, image_size=
 
 
 class Shells(Field):
-    """Fog in the shells around the origin between given radii, whose colours are their numbers."""
+    """Fog in the shells around the origin between given radii, with their numbers as colours."""
 
     def __init__(self, *shells: tuple[float, float, float]) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ def test_without_an_end_rays_that_meet_nothing_have_one_sample() -> None:
 
 
 def test_a_wall_hides_the_sky() -> None:
-    """Rays that end early have no last sample, and differ from those that do not by less than the threshold."""
+    """Rays that end early have no last sample, and differ from other rays by less than the threshold."""
     field, rays = Shells((2.0, 3.0, 30.0), (100.0, 1e12, 1e-3)), rays_from_the_middle()
     exact = rendered(sampler(), field, rays)[1].color
     field.positions.clear()
@@ -111,7 +111,7 @@ def test_a_wall_hides_the_sky() -> None:
 
 
 def test_gradients_reach_all_samples_and_the_last() -> None:
-    """By the density's scale, against one evaluation of all samples."""
+    """The gradient by the density's scale is compared with one evaluation of all samples."""
     scale = torch.ones((), requires_grad=True)
 
     class Scaled(Shells):
@@ -219,7 +219,7 @@ def test_boxes_reach_the_far_end_as_far_as_there_may_be_boxes(far: float, levels
 
 
 def test_cells_that_no_camera_shows() -> None:
-    """One camera at the origin that looks along -z: what is behind it is not seen, nor what is too near before it."""
+    """One camera at the origin that looks along -z: cells behind it are not seen, nor cells too near before it."""
     pose = torch.eye(3, 4)[None]
     size = torch.tensor([40])
     cameras = Cameras(pose, *[torch.tensor([v]) for v in (20.0, 20.0, 20.0, 20.0)], size, size)
@@ -235,7 +235,7 @@ def test_cells_that_no_camera_shows() -> None:
 
 
 def test_a_wide_lens_shows_more_beside_its_middle() -> None:
-    """At 76 degrees from the axis a ball is 17 times as large on the image as in its middle."""
+    """A ball 76 degrees from the axis is 17 times as large on the image as in its middle."""
     size = torch.tensor([40])
     cameras = Cameras(torch.eye(3, 4)[None], *[torch.tensor([v]) for v in (7.0, 7.0, 20.0, 20.0)], size, size)
     x, y, z = ((torch.cartesian_prod(*[torch.arange(64)] * 3) + 0.5) / 32 - 1).unbind(-1)

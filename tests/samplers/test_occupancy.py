@@ -17,7 +17,7 @@ BOX = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
 
 def random_rays(count: int, seed: int = 0, near: float = 0.0) -> Rays:
-    """From a sphere of radius 3 towards points in and near the box."""
+    """Rays from a sphere of radius 3 towards points in and near the box."""
     generator = torch.Generator().manual_seed(seed)
     origins = torch.randn(count, 3, generator=generator)
     origins = 3 * origins / origins.norm(dim=-1, keepdim=True)
@@ -58,7 +58,7 @@ def test_a_full_grid_covers_each_rays_chord(jitter: bool) -> None:
 
 
 def test_steps_may_be_shorter_outside_of_training() -> None:
-    """Then the samples are those of a grid with as many more steps, and in training they are as without."""
+    """Then the samples equal a grid's with more steps, and in training they are unchanged."""
     rays = random_rays(50)
     both = OccupancySampler(BOX, resolution=16, num_steps=60, eval_step_scale=0.5)
     grids = {True: OccupancySampler(BOX, resolution=16, num_steps=60), False: OccupancySampler(BOX, 16, num_steps=120)}
@@ -98,7 +98,7 @@ def test_skipping_finds_exactly_the_occupied_steps(resolution: int, num_steps: i
 
 
 class CountingField(Field):
-    """Random but fixed densities; counts what is asked of it."""
+    """Random but fixed densities; it counts evaluations."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -115,7 +115,7 @@ class CountingField(Field):
 
 
 class KeptField(CountingField):
-    """The same by an operation of ours, whose results are kept for the backward pass."""
+    """The same by an operation of ours; its results are kept for the backward pass."""
 
     def density(self, points: Points):
         self.asked.append(points.positions.detach())
@@ -214,7 +214,7 @@ def test_state_survives_a_checkpoint() -> None:
 
 
 def test_slices_of_time_hold_what_is_there_at_their_time() -> None:
-    """A ball that crosses the box in 8 slices: its cells of a slice are those that it touches in that time."""
+    """A ball crosses the box in 8 slices: its cells of a slice are the cells that it touches in that time."""
 
     def density(points: Points) -> tuple[torch.Tensor, torch.Tensor]:
         assert points.times is not None

@@ -1,4 +1,4 @@
-"""Proposals: where samples go, and that they learn to bound what is there."""
+"""Proposals: places of samples, and training to bound the density."""
 
 import math
 from dataclasses import replace
@@ -132,7 +132,7 @@ def test_annealing_is_the_papers() -> None:
 
 
 def test_light_that_no_wall_stops_ends_in_the_last_interval_of_an_unbounded_ray() -> None:
-    """The sky is learnt as matter far away: whatever density is there is opaque over an endless interval."""
+    """The sky is learnt as matter far away: any density there is opaque over an endless interval."""
     sampler = ProposalSampler(BOX, (16, 8, 4), unbounded=True, endless=True)
     rendered = shown(Wall(0.3, 1e9), sampler, rays_along_x(5), 1.0, jitter=False)
     torch.testing.assert_close(rendered.accumulation, torch.ones(5))
@@ -143,7 +143,7 @@ def test_light_that_no_wall_stops_ends_in_the_last_interval_of_an_unbounded_ray(
 
 
 class Asked(Wall):
-    """A wall that remembers what it was asked about, and learns how dense it is."""
+    """A wall that records its calls, with a density to learn."""
 
     def __init__(self, footprint: str) -> None:
         super().__init__(0.3, 0.5)

@@ -1,4 +1,4 @@
-"""Training samples in a fixed number of slots: the same pictures and gradients, and capacity for what is needed."""
+"""Training samples in a fixed number of slots: the same pictures and gradients, and enough capacity."""
 
 from dataclasses import replace
 

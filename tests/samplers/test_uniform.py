@@ -36,7 +36,7 @@ def test_one_sample_in_each_bin(jitter: bool) -> None:
 
 
 def test_stratification_integrates_better_than_chance() -> None:
-    """Of x^2 over [0, 1]: the error of 16 stratified points is far below that of 16 independent ones."""
+    """The integral of x^2 over [0, 1] has a far smaller error with 16 stratified points than with independent ones."""
     torch.manual_seed(0)
     rays = Rays(torch.zeros(2000, 3), torch.zeros(2000, 3), torch.zeros(2000), torch.ones(2000))
     error = (stratified_points(rays, 16, True) ** 2).mean(-1) - 1 / 3

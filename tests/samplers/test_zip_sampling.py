@@ -1,4 +1,4 @@
-"""What Zip-NeRF adds to proposals: the power ladder, frustums for densities that ask for them, and the blurred loss."""
+"""Zip-NeRF's parts of proposals: the power ladder, frustums for densities that ask for them, and the blurred loss."""
 
 import pytest
 import torch
@@ -67,7 +67,7 @@ def test_spacing_by_the_ladder_meets_both_ends_and_is_the_papers_between() -> No
 
 
 class Fog(Field):
-    """Even fog, which notes what points it is asked about."""
+    """Even fog, which records its points."""
 
     def __init__(self, footprint: str) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ def rays(count: int) -> Rays:
 
 @pytest.mark.parametrize("footprint", ["frustum", "gaussian", "radius"])
 def test_a_density_gets_the_footprint_that_it_asks_for(footprint: str) -> None:
-    """Of the intervals whose weights it makes, with their times, and without a gradient to the rays."""
+    """The frustums are the intervals of its weights, with their times, and without a gradient to the rays."""
     plain, sized = Fog("none"), Fog(footprint)
     samples = propose(
         rays(5), [plain.density, sized.density], (8, 6, 4), 1.0, jitter=False, power=1.0, learning=True,

@@ -22,7 +22,7 @@ FLAGS = ["-O1", "-g1", "-fPIC", "-fno-omit-frame-pointer", "-D_GLIBCXX_ASSERTION
 
 
 class Missing(Exception):
-    """What a build with sanitizers needs is not here."""
+    """A requirement of a build with sanitizers is missing."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Sanitized:
     variant: str
     folder: Path
     preloaded: tuple[Path, ...]
-    """What must be loaded before Python: AddressSanitizer, and the C++ library, whose exceptions it looks for then."""
+    """Libraries to load before Python: AddressSanitizer, and the C++ library with the exceptions it looks for."""
 
 
 def runtime() -> tuple[Path, ...]:
@@ -54,7 +54,8 @@ def build() -> Sanitized:
     Raises: Missing without compiler or runtime; CalledProcessError where it does not compile.
     """
     preloaded = runtime()
-    # Compilers do not see what instructions for tiles read and write: those of vectors are looked at in their place.
+    # Compilers do not see the memory that instructions for tiles access: vector instructions are checked in their
+    # place.
     kinds = [name for name in NEEDS if name != "amx_bf16"]
     variant = next(name for name in kinds if cpu_features().issuperset(NEEDS[name]))
     extension = next(e for e in extensions() if e.name.rsplit(".", 1)[-1] == variant)
@@ -72,7 +73,7 @@ def build() -> Sanitized:
 
 
 def extensions() -> list[Extension]:
-    """What setup.py would build."""
+    """The extensions that setup.py would build."""
     before = Path.cwd()
     os.chdir(ROOT)
     try:

@@ -19,7 +19,7 @@ print("nobody minded")
 """
 """A pixel is looked up of 64, the kernel being told that there are many more."""
 CONTROLS = {64: "heap-buffer-overflow", 2**62: "runtime error: signed integer overflow"}
-"""Which pixel, and what must be said of it: by AddressSanitizer, and by UndefinedBehaviorSanitizer."""
+"""Index of a pixel -> message expected from AddressSanitizer, or from UndefinedBehaviorSanitizer."""
 TESTS = [
     "tests/kernels",
     "--ignore=tests/kernels/test_native.py",  # which is about the other libraries
@@ -29,7 +29,7 @@ TESTS = [
 
 
 def check(library: Sanitized) -> int:
-    """Run the controls, then the kernels' tests. Returns: the exit status; the last line says what was found."""
+    """Run the controls, then the kernels' tests. Returns: the exit status; the last line has the findings."""
     for index, words in CONTROLS.items():
         said = control(library, index)
         if words not in said:
@@ -52,7 +52,7 @@ def check(library: Sanitized) -> int:
         "not slow",
         *TESTS,
     ]
-    # What a sanitizer says goes to the file descriptor, which pytest would otherwise keep from an aborted process.
+    # A sanitizer's message goes to the file descriptor, which pytest would otherwise keep from an aborted process.
     status = subprocess.run(run, cwd=ROOT, env=environment(library), check=False).returncode
     found = "nothing found" if status == 0 else f"something found, or a test that failed (exit status {status})"
     print(f"sanitize: {library.variant} with address, undefined and library assertions: {found}")
@@ -60,7 +60,7 @@ def check(library: Sanitized) -> int:
 
 
 def control(library: Sanitized, index: int) -> str:
-    """What a process says that looks up a pixel that is not there."""
+    """The output of a process that looks up a missing pixel."""
     code = BAD_CALL.format(index=index, variant=library.variant)
     run = [sys.executable, "-c", code]
     done = subprocess.run(run, cwd=ROOT, env=environment(library), capture_output=True, text=True, check=False)
@@ -68,7 +68,7 @@ def control(library: Sanitized, index: int) -> str:
 
 
 def environment(library: Sanitized) -> dict[str, str]:
-    """Of a process that uses the library. Python and torch leak by design."""
+    """Variables of a process that uses the library. Python and torch leak by design."""
     return {
         **os.environ,
         "LD_PRELOAD": ":".join(map(str, library.preloaded)),

@@ -19,9 +19,9 @@ from tests.site.pages import ROOT
 EXAMPLES = ("my-method", "plain-grid")
 """Methods that the documents let their readers write."""
 UNCHECKED = ("nerfbaselines", "export", ".", "source", "pytest")
-"""Commands of others, and those that no parser here knows."""
+"""Commands of others, and commands without a parser here."""
 TAKE_RUNS = ("run_flags",)
-"""What looks whether a trained run is there."""
+"""Functions that check for a trained run."""
 SURFACES = "scan.ply", "scan_points.ply", "made_elsewhere.glb", "solids/reference.ply"
 """Files of surfaces that commands of the documents name."""
 FORMATS = {"lego": "blender", "balls": "dnerf", "ring": "blender"}
@@ -42,10 +42,10 @@ def found(path: Path | None, named: str | None = None) -> tuple[Path | None, str
 
 
 class Checker:
-    """Runs commands up to where they would begin to work, in an empty folder.
+    """Runs commands until they would begin to work, in an empty folder.
 
     Args:
-        monkeypatch: what is exchanged for the checks, and put back after them.
+        monkeypatch: exchanges functions for the checks, and puts them back after them.
         folder: working folder.
     """
 
@@ -163,5 +163,5 @@ def check_python(words: list[str]) -> None:
 
 
 def formats() -> list[str]:
-    """The data formats whose names the documents use; each can be loaded."""
+    """The data formats that the documents name; each can be loaded."""
     return [load_dataparser(name).__name__ for name in {*FORMATS.values(), "nerfstudio"}]

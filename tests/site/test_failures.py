@@ -69,7 +69,7 @@ def test_plain_surroundings_are_white_outside_of_the_masks(failures: ModuleType)
 
 
 def test_the_lens_shows_what_a_pinhole_shows_elsewhere(failures: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a scene whose colours are directions: each pixel has the colour of the direction that its lens gives it."""
+    """The scene has directions as colours: each pixel has the colour of its direction by the lens."""
     x, y = failures.pinhole_of(np.array([0.2, 0.36]), np.array([-0.3, 0.36]))
     squared = x * x + y * y
     np.testing.assert_allclose(x * (1 + failures.K1 * squared), [0.2, 0.36], atol=1e-12)

@@ -1,4 +1,4 @@
-"""Figures in the documents are those of the evaluations that they name, and tables of names those of the code."""
+"""Figures in the documents equal the evaluations that they name, and tables of names the code."""
 
 import json
 import re
@@ -87,7 +87,7 @@ def test_results_are_shown_or_rows_of_a_table(tables: ModuleType) -> None:
 
 
 def test_what_stands_beside_published_results_is_in_the_figures() -> None:
-    """In the table of Lego the fourth column is ours; its PSNRs stand in the table of figures."""
+    """The fourth column of the table of Lego is ours; its PSNRs are in the table of figures."""
     ours = PSNR.findall(" ".join(row[3] for row in rows(DOCS / "published.md") if len(row) == 5))
     known = (DOCS / "figures.md").read_text()
     assert len(ours) >= 5

@@ -41,7 +41,7 @@ def lines() -> ModuleType:
     ],
 )  # fmt: skip
 def test_what_is_kept_together(lines: ModuleType, before: str, after: str) -> None:
-    """In what is expected, {word} stands for a word kept whole, and 3_s for an unbreakable space."""
+    """{word} in the expected text stands for a word kept whole, and 3_s for an unbreakable space."""
     expected = re.sub(r"\{(.*?)\}", r'<span class="whole">\1</span>', after)
     assert lines.keep_together(before) == re.sub(r"(?<=[\d±])_", SPACE, expected)
 

@@ -1,4 +1,4 @@
-"""The page of each method says of every flag what the command line does."""
+"""The page of each method agrees with the command line about every flag."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ def method_pages() -> Iterator[ModuleType]:
 
 @pytest.fixture(scope="module")
 def generated(method_pages: ModuleType) -> Callable[[str], str]:
-    """What is made from a method's code alone."""
+    """The part of a page made from a method's code alone."""
     return cache(lambda name: method_pages.page(name, None))
 
 

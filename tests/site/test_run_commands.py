@@ -30,7 +30,7 @@ SMALL = {
     "--num-frames": "2", "--resolution": "16", "--texture-size": "64", "--target-num-faces": "200",
     "--fit-seconds": "1", "--max-images": "1", "--max-seconds": "20", "--width": "32", "--height": "18",
 }  # fmt: skip
-"""Flags whose values are exchanged, so that a command takes seconds."""
+"""Flags with exchanged values, so that a command takes seconds."""
 ADDED = {
     "ns-train": ["--max-num-iterations", "2", "--vis", "none", "--max-eval-images", "1"],
     "orbit": ["--num-frames", "2"],

@@ -17,7 +17,7 @@ from tests.site.test_run_commands import execute, in_small, shown
 pytestmark = pytest.mark.slow
 PICTURES = ("--data path/to/photographs", "--data walk.mp4")
 PROCESSED = [c for c in shown("ns-process-data") if any(data in c for data in PICTURES) and "FISHEYE" not in c]
-"""What makes poses from pictures. Exports of apps, and lenses, are read in tests/truth/test_processing.py."""
+"""Commands that find poses from pictures. Exports of apps, and lenses, are read in tests/truth/test_processing.py."""
 COMPARED = shown("ns-compare")
 
 
@@ -62,7 +62,7 @@ def test_methods_are_compared(command: str, walk: Path, tmp_path: Path, monkeypa
 
 
 def test_the_first_capture_from_photographs_to_a_mesh(walk: Path, tmp_path: Path) -> None:
-    """The guide's five commands one after the other, each with what the one before has made."""
+    """The guide's five commands one after the other, each with the files of the one before."""
     pytest.importorskip("pycolmap")
     page = ROOT / "docs/start/first-capture.md"
     (block,) = [block for block in blocks(page) if block.text.startswith("ns-process-data")]

@@ -13,7 +13,7 @@ from tests.site.pages import PAGES, ROOT, Block, blocks
 from tests.training.helpers import TINY
 
 EXECUTED = ("start/first-picture", "guides/video", "python/index")
-"""Pages whose Python needs a run at most. Of other pages: plug-and-play in tests/plug_and_play, those below, and
+"""Pages with Python that needs a run at most. Other pages: plug-and-play in tests/plug_and_play, those below, and
 signatures, which are not programs."""
 RUN = "outputs/lego/instant-ngp/TIME"
 

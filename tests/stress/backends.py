@@ -1,7 +1,7 @@
-"""What the stress tests share: which implementations a test runs on, and how much hypothesis may try.
+"""Shared by the stress tests: the implementations of a test, and the number of examples of hypothesis.
 
 A backend is a way to compute the kernels. `reference` is torch alone: kernels are then their `*_reference` functions.
-`compiled` is the C++ library, through the public functions. A further one is a name in `BACKENDS`, what it needs in
+`compiled` is the C++ library, through the public functions. A further one is a name in `BACKENDS`, its requirements in
 `MARKS`, and a branch in `switch_to`.
 """
 

@@ -1,4 +1,4 @@
-"""The backends, and the table: `pytest tests/stress --stress-table FILE` writes what became of each entry on each."""
+"""The backends, and the table: `pytest tests/stress --stress-table FILE` writes the result of each entry on each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The known numerical failures of the field, and what became of each on each backend, as a table in Markdown."""
+"""The known numerical failures of the field, and the result of each on each backend, as a table in Markdown."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 from tests.stress.backends import BACKENDS
 
 SHARED = "shared"
-"""The column of what is the same code on every backend."""
+"""The column of code that all backends share."""
 ABSENT = {"Triton interpreter": "does not apply: there are no Triton kernels yet"}
-"""Columns of backends that are still to be written, and what stands in them."""
+"""Columns of backends that are still to be written, and their content."""
 COLUMNS = (*BACKENDS, *ABSENT, SHARED)
 ENTRIES = {
     1: "exp and softplus overflow: 12 in half precision, 89 in single",
@@ -46,7 +46,7 @@ ENTRIES = {
 
 @dataclass
 class Cell:
-    """What became of the tests of one entry on one backend."""
+    """The results of the tests of one entry on one backend."""
 
     passed: int = 0
     failed: list[str] = field(default_factory=list)
@@ -57,7 +57,7 @@ class Cell:
     """Why tests did not run."""
 
     def text(self) -> str:
-        """In a few words."""
+        """The result in a few words."""
         parts = []
         if self.failed:
             parts.append(f"**FAIL**: {', '.join(self.failed)}")
@@ -91,7 +91,7 @@ class Table:
                 cell.passed += 1
 
     def text(self, entry: int, backend: str) -> str:
-        """What stands in a cell."""
+        """The content of a cell."""
         if backend in ABSENT:
             return ABSENT[backend]
         if (entry, backend) in self.cells:

@@ -1,4 +1,4 @@
-"""Compositing of opacities: from nothing to what is opaque, thin and long rows of them, NaN, rays without samples."""
+"""Compositing of opacities: from transparent to opaque, thin and long rows of them, NaN, rays without samples."""
 
 import math
 
@@ -17,7 +17,7 @@ LEAK = 1.01 * torch.finfo(torch.float32).eps ** 0.5
 """The share of light that gets through an opacity of 1."""
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 CLEAR = st.sampled_from([0.0, 1e-30, 1e-9, 1e-4, 0.3, 0.9, 0.999])
-"""Opacities behind which light is left."""
+"""Opacities that leave light."""
 
 
 def row(alphas: list[list[float]], requires_grad: bool = False) -> tuple[Rays, Samples, Tensor, Tensor]:
@@ -50,7 +50,7 @@ def products(alpha: Tensor) -> Tensor:
 @FEW
 @given(alphas=st.lists(st.lists(CLEAR, max_size=5), min_size=1, max_size=4))
 def test_pictures_and_gradients_are_those_of_products(backend: str, alphas: list[list[float]]) -> None:
-    """Of rays with and without samples, against float64; lengths of intervals do not matter."""
+    """Rays with and without samples are compared with float64; lengths of intervals do not matter."""
     rays, samples, alpha, rgb = row(alphas, requires_grad=True)
     out = volume_render(rays, samples, alpha, rgb, BACKGROUND, is_alpha=True)
     factors = torch.tensor([[1.0, -0.5, 2.0]])
@@ -91,7 +91,7 @@ def test_a_thousand_thin_opacities_are_not_lost(backend: str) -> None:
 @backends()
 @pytest.mark.parametrize("alpha", [1.0, 1 - 2.0**-24, 1 - 2.0**-13])
 def test_what_is_opaque_hides_what_is_behind_and_can_learn(backend: str, alpha: float) -> None:
-    """As much as LEAK gets through, and the gradient of 1 / (1 - alpha) is finite."""
+    """LEAK is the part that gets through, and the gradient of 1 / (1 - alpha) is finite."""
     rays, samples, alphas, rgb = row([[0.25, alpha, 0.5]], requires_grad=True)
     out = volume_render(rays, samples, alphas, rgb, BACKGROUND, is_alpha=True)
     exact = alphas.detach().double()

@@ -116,7 +116,7 @@ def test_contracted_gaussians_have_the_moments_of_contracted_draws(distance: flo
     scale = sampled.diagonal(dim1=1, dim2=2).sum(-1)
     assert ((draws.mean(1) - found).norm(dim=-1) < 5 * (scale / DRAWS).sqrt() + 1e-6 * scale.sqrt()).all()
     error = (contracted @ contracted.mT - sampled).abs().amax((1, 2))
-    print(f"contracted covariances: off those of {DRAWS:,} draws by {(error / scale).max():.1e} of their traces")
+    print(f"contracted covariances: off {DRAWS:,} draws by {(error / scale).max():.1e} of their traces")
     assert (error < (6 / math.sqrt(DRAWS) + 1e-3) * scale).all()
 
 
@@ -221,7 +221,7 @@ def test_directions_between_the_axes_tell_needles_from_balls() -> None:
     needle = Points(torch.zeros(1, 3, dtype=F64), axes=axis, variances=torch.tensor([[0.3, 1e-6]], dtype=F64))
     ball = Points(torch.zeros(1, 3, dtype=F64)).sized(0.1**0.5)
     box = torch.tensor([[-1.0] * 3, [1.0] * 3], dtype=F64)
-    # The covariances along the axes are what `sample_points` computes for such an axis: a third of 0.3 each.
+    # `sample_points` computes these covariances along the axes for such an axis: a third of 0.3 each.
     needle = Points(needle.positions, axes=axis, variances=needle.variances, covariances=ball.covariances)
     along_axes, between = (
         IntegratedEncoding(box, 3, 1.0, False, each).double() for each in (None, icosahedron_directions())

@@ -19,11 +19,11 @@ DRAWS = 400_000
 ENDS = [(0.0, 1.0), (0.0, 1e-3), (0.5, 0.75), (2.0, 6.0), (100.0, 100.01), (1e4, 3e4)]
 """Where frustums begin and end: cones with their apex, short and long ones, thin slices, far away."""
 RADII = [1e-6, 1e-3, 0.3]
-"""Of a cone at distance 1: of a telephoto lens, of a usual pixel, of a wide cone."""
+"""Radii of a cone at distance 1: for a telephoto lens, a usual pixel, a wide cone."""
 
 
 def drawn_in_frustum(start: float, end: float, radius: float, generator: torch.Generator) -> Tensor:
-    """Points (N, 3) drawn evenly in a frustum around z, float64: those of the cylinder around it that lie within."""
+    """Points (N, 3) drawn evenly in a frustum around z, float64: draws in the cylinder around it that lie within."""
     t = start + (end - start) * torch.rand(DRAWS, generator=generator, dtype=F64)
     across = radius * end * (2 * torch.rand(DRAWS, 2, generator=generator, dtype=F64) - 1)
     within = across.norm(dim=-1) < radius * t
@@ -31,7 +31,7 @@ def drawn_in_frustum(start: float, end: float, radius: float, generator: torch.G
 
 
 def exact_moments(start: float, end: float, radius: float) -> tuple[Fraction, Fraction, Fraction]:
-    """Mean distance, variance along the axis and across it, by integrals of t^2 dt, whatever cancels."""
+    """Mean distance, variance along the axis and across it, by integrals of t^2 dt, without cancellation."""
     a, b, r = Fraction(start), Fraction(end), Fraction(radius)
     if a == b:
         return a, Fraction(0), r * r * a * a / 4
@@ -41,7 +41,7 @@ def exact_moments(start: float, end: float, radius: float) -> tuple[Fraction, Fr
 
 
 def assert_like(found: Tensor, draws: Tensor, spread: Tensor) -> None:
-    """A mean over draws (N, ...) is what was found, within five standard errors."""
+    """Check that a mean over draws (N, ...) equals `found`, within five standard errors."""
     assert bool(((draws.mean(0) - found).abs() <= 5 * spread / math.sqrt(len(draws))).all())
 
 
@@ -66,7 +66,7 @@ def test_a_frustums_gaussian_has_the_moments_of_points_drawn_in_it(start: float,
 @pytest.mark.parametrize("radius", RADII)
 @pytest.mark.parametrize(("start", "end"), [*ENDS, (100.0, 100.0), (0.0, 0.0), (1.0, LAST_INTERVAL), (0.0, 1e15)])
 def test_a_frustums_moments_are_exact_to_rounding(start: float, end: float, radius: float, dtype: torch.dtype) -> None:
-    """From 100 to 100.01 the variance along the axis is 8.3e-6, which E[t^2] - E[t]^2 loses in float32."""
+    """The variance along the axis from 100 to 100.01 is 8.3e-6, which E[t^2] - E[t]^2 loses in float32."""
     given_ends = torch.tensor([start, end, radius], dtype=dtype)
     found = [moment.item() for moment in conical_frustums(*given_ends[:, None])]
     truth = [float(moment) for moment in exact_moments(*given_ends.tolist())]
@@ -81,7 +81,7 @@ def test_a_frustums_moments_are_exact_to_rounding(start: float, end: float, radi
     radius=st.sampled_from([0.0, 1e-7, 1e-3, 1.0]),
 )
 def test_no_variance_is_negative_or_nan(start: float, length: float, radius: float) -> None:
-    """In float32, of any interval: of one as long as rounding leaves it, of none, and of one without end."""
+    """This holds in float32 for any interval: as long as rounding leaves it, empty, or without end."""
     ends = torch.tensor([[start], [start + length], [radius]])
     mean, along, across = (moment.item() for moment in conical_frustums(*ends))
     first, last = ends[0].item(), ends[1].item()
@@ -92,7 +92,7 @@ def test_no_variance_is_negative_or_nan(start: float, length: float, radius: flo
 
 @pytest.mark.entry(10)
 def test_a_frustum_without_length_at_the_origin_has_a_gradient() -> None:
-    """As rays that miss a box have them, where poses are learnt."""
+    """Rays that miss a box have such frustums, and poses may be learnt."""
     ends = torch.zeros(2, requires_grad=True)
     sum(conical_frustums(ends[:1], ends[1:], torch.ones(1))).sum().backward()
     assert ends.grad is not None
@@ -103,7 +103,7 @@ def test_a_frustum_without_length_at_the_origin_has_a_gradient() -> None:
 
 
 def two_rays(radii: Tensor | None) -> tuple[Rays, Samples]:
-    """An oblique ray with two intervals and one along -y with three, whose points are not their middles; float64."""
+    """An oblique ray with two intervals and one along -y with three; their points are not their middles; float64."""
     directions = torch.nn.functional.normalize(torch.tensor([[1.0, -2.0, 0.5], [0.0, -1.0, 0.0]], dtype=F64), dim=-1)
     origins = torch.tensor([[0.1, 0.2, 0.3], [5.0, 0.0, -1.0]], dtype=F64)
     rays = Rays(origins, directions, torch.zeros(2, dtype=F64), torch.full((2,), 9.0, dtype=F64), radii)

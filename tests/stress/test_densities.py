@@ -1,4 +1,4 @@
-"""From a network's output to a density, and what an occupancy grid makes of densities."""
+"""From a network's output to a density, and an occupancy grid's cells from densities."""
 
 import math
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ each_type = pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, tor
 
 
 def tolerance(dtype: torch.dtype) -> float:
-    """Of a gradient that is rounded to a type, relative."""
+    """Relative tolerance of a gradient that is rounded to a type."""
     return max(2 * torch.finfo(dtype).eps, 1e-6)
 
 
@@ -131,7 +131,7 @@ def occupied_cells(density: torch.Tensor) -> torch.Tensor:
 @backends()
 @pytest.mark.parametrize("share", [1.0, 0.5])
 def test_cells_of_any_density(backend: str, share: float) -> None:
-    """From nothing to what is not known yet, which is infinite: against opacity in float64."""
+    """Densities go from 0 to infinity, which marks unknown cells; the truth is opacity in float64."""
     density = torch.zeros(CELLS)
     filled = int(CELLS * share)
     density[:filled] = torch.logspace(-30, 30, filled)

@@ -47,7 +47,7 @@ ENCODINGS: dict[str, tuple[Callable[..., Tensor], Callable[..., Tensor], Tensor]
     "hash grid": (lambda x, t: hash_grid(x, t, HASH), lambda x, t: hash_grid_reference(x, t, HASH), hash_table()),
     "planes": (lambda x, t: planes(x, t, PLANES), lambda x, t: planes_reference(x, t, PLANES), plane_table()),
 }
-"""An encoding of positions in [0, 1]^3, what is true of it in float64, and a table."""
+"""An encoding of positions in [0, 1]^3, its truth in float64, and a table."""
 each_encoding = pytest.mark.parametrize("encoding", ENCODINGS)
 
 
@@ -177,7 +177,7 @@ def test_second_derivatives_are_right_or_refused(backend: str, name: str) -> Non
     include_input=st.booleans(),
 )
 def test_high_frequencies_of_large_positions(backend: str, values: list[float], include_input: bool) -> None:
-    """Angles of 512,000 at x = 1000: 2^k x is exact in float32, and so must be what sin and cos make of it."""
+    """Angles are 512,000 at x = 1000: 2^k x is exact in float32, and so must be its sine and cosine."""
     x = torch.tensor(values).view(-1, 1).requires_grad_()
     true_x = x.detach().double().requires_grad_()
     found = frequency_encoding(x, 10, include_input)
@@ -210,7 +210,7 @@ ANY_SHAPE: dict[str, Callable[[Tensor], Tensor]] = {
     "to disparity": to_disparity,
     "from disparity": from_disparity,
 }
-"""What says that it takes (..., 3)."""
+"""Functions documented to take (..., 3)."""
 ROWS: dict[str, Callable[[Tensor], Tensor]] = {
     "hash grid": lambda x: hash_grid(x, hash_table(), HASH),
     "planes": lambda x: planes(x, plane_table(), PLANES),
@@ -225,11 +225,11 @@ ROWS: dict[str, Callable[[Tensor], Tensor]] = {
         torch.arange(4.0).expand(*x.shape[:-1], 4), x, torch.full((*x.shape[:-1], 2), 0.4)
     ),
 }
-"""What says that it takes (N, 3)."""
+"""Functions documented to take (N, 3)."""
 
 
 def flattened(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """Of rows, put back into the shape that they came in."""
+    """Apply a function to rows, and restore the shape."""
     return function(x.reshape(-1, x.shape[-1])).unflatten(0, x.shape[:-1])
 
 
@@ -248,7 +248,7 @@ def test_any_batch_dimensions_are_rows(name: str, shape: list[int]) -> None:
 @pytest.mark.parametrize("name", ROWS)
 @pytest.mark.parametrize("shape", [(2, 4, 3), (3, 3, 3), (4, 1, 3), (0, 2, 3)])
 def test_two_batch_dimensions_are_rows_or_refused(backend: str, name: str, shape: tuple[int, ...]) -> None:
-    """What takes rows alone says so where it is given more, or treats them as rows; it never mixes them up."""
+    """A function of rows alone refuses more dimensions, or treats them as rows; it never mixes them up."""
     x = torch.rand(*shape, generator=torch.Generator().manual_seed(0))
     try:
         found = ROWS[name](x)

@@ -30,7 +30,7 @@ from tests.stress.backends import COMPILED, FEW, backends
 
 CUBE = torch.tensor([[-1.0] * 3, [1.0] * 3])
 WIDE = torch.tensor([[-2.0] * 3, [2.0] * 3])
-"""A box whose half edge is 2."""
+"""A box with a half edge of 2."""
 AXES = st.tuples(*[st.sampled_from([-1.0, -0.3, 0.0, 0.02, 1.0])] * 3)
 SOURCES = [file for name in ("framework", "methods") for file in (Path(__file__).parents[2] / name).rglob("*.py")]
 
@@ -50,7 +50,7 @@ def unit(axes: tuple[float, ...]) -> list[float]:
 
 
 def contracted_by_hand(positions: Tensor, incoming: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Value and gradient (N, 3) of contraction around `WIDE`, float64, and the largest that the gradient can be (N, 1).
+    """Value and gradient (N, 3) of contraction around `WIDE`, float64, and the largest possible gradient (N, 1).
 
     With n = |x| > 1 and y = x s(n), s(n) = 2 / n - 1 / n^2: J^T g = s g + x (x . g) s'(n) / n.
     """
@@ -129,7 +129,7 @@ def test_disparity_has_a_slope_everywhere(dtype: torch.dtype) -> None:
 @pytest.mark.entry(8, 14, 15)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_distance_has_a_slope_everywhere(dtype: torch.dtype) -> None:
-    """At s = 1, which is infinitely far away, both value and slope are finite."""
+    """Both value and slope are finite at s = 1, which is infinitely far away."""
     s = torch.tensor([0.0, 0.25, 0.5, 0.75, 1 - 2.0**-20, 1.0], dtype=dtype, requires_grad=True)
     t = from_disparity(s)
     (slope,) = torch.autograd.grad(t.sum(), s)
@@ -157,7 +157,7 @@ def test_srgb_curves_have_a_slope_and_a_value_at_black() -> None:
 
 
 def crossings(backend: str, origins: Tensor, directions: Tensor) -> list[tuple[float, float] | None]:
-    """Where rays enter and leave `CUBE`; None for those that miss it."""
+    """Where rays enter and leave `CUBE`; None for rays that miss it."""
     count = len(origins)
     if backend == COMPILED:
         rays = Rays(origins, directions, torch.zeros(count), torch.full((count,), torch.inf))
@@ -186,7 +186,7 @@ def exact_crossing(origin: list[float], direction: list[float]) -> tuple[float, 
 
 
 def assert_crossings(backend: str, rays: list[tuple[tuple[float, ...], tuple[float, ...]]]) -> None:
-    """Like the exact ones; what only grazes the box may be hit or missed."""
+    """Check crossings against exact ones; a ray that only grazes the box may hit or miss."""
     origins, directions = (torch.tensor([ray[i] for ray in rays]).view(-1, 3) for i in (0, 1))
     found = crossings(backend, origins, directions)
     for origin, direction, pair in zip(origins.tolist(), directions.tolist(), found, strict=True):
@@ -253,7 +253,7 @@ def test_any_rays_and_a_box(backend: str, rays: list[tuple[tuple[float, ...], tu
 @FEW
 @given(axes=AXES.filter(any), exponent=st.floats(-11, 18))
 def test_directions_are_of_length_one(axes: tuple[float, ...], exponent: float) -> None:
-    """And their gradient is what is left across them, over the length: J^T g = (g - n (n . g)) / |v|."""
+    """Their gradient is the part across them, over the length: J^T g = (g - n (n . g)) / |v|."""
     length = 10.0**exponent
     v = torch.tensor([[x * length for x in unit(axes)]], requires_grad=True)
     found = safe_normalize(v)

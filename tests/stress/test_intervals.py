@@ -26,14 +26,14 @@ FINITE = EXTREMES[:-1]
 INTERVAL = st.tuples(st.sampled_from(EXTREMES), st.sampled_from(EXTREMES))
 """Density and length of an interval."""
 ENDING = st.tuples(st.sampled_from(EXTREMES), st.sampled_from(FINITE))
-"""The same of one behind which others can follow along the same line."""
+"""The same for an interval that others can follow along the same line."""
 TABLES = st.tuples(st.integers(1, 6), st.integers(0, 4)).flatmap(
     lambda shape: st.tuples(
         st.just(shape[0]),
         st.lists(st.lists(ENDING, min_size=shape[0], max_size=shape[0]), min_size=shape[1], max_size=shape[1]),
     )
 )
-"""How many intervals a ray has, and those of each ray."""
+"""Maximum number of intervals of a ray, and the intervals of each ray."""
 THIN = 4096
 """Samples in a thin medium."""
 
@@ -63,7 +63,7 @@ def slopes_by_hand(ray: Ray, factors: list[float]) -> list[float]:
 
 
 def some_factors(count: int) -> list[float]:
-    """Of alternating sign and different sizes."""
+    """Factors of alternating sign and different sizes."""
     return [(-1.0) ** i * (i + 1) / 4 for i in range(count)]
 
 
@@ -99,7 +99,7 @@ each_function = pytest.mark.parametrize("function", ["composite", "composite, pa
 @FEW
 @given(rays=st.lists(st.lists(INTERVAL, max_size=6), max_size=4))
 def test_extreme_densities_and_lengths(backend: str, rays: list[Ray]) -> None:
-    """Optical depth is cut off, and never NaN; rays without intervals show what is behind them."""
+    """Optical depth is cut off, and never NaN; rays without intervals show the background."""
     samples, sigma = packed(rays)
     found = composited(samples, sigma)
     ends = samples.offsets.tolist()
@@ -116,7 +116,7 @@ def test_extreme_densities_and_lengths(backend: str, rays: list[Ray]) -> None:
 @FEW
 @given(ray=st.lists(INTERVAL, max_size=6))
 def test_slopes_of_extreme_densities_and_lengths(backend: str, ray: Ray) -> None:
-    """In proportion to the length; of an interval without end there is none at all."""
+    """Slopes are proportional to the length; an interval without end has none."""
     samples, sigma = packed([ray])
     factors = some_factors(len(ray))
     weights = composited(samples, sigma.requires_grad_()).weights
@@ -131,7 +131,7 @@ def test_slopes_of_extreme_densities_and_lengths(backend: str, ray: Ray) -> None
 @FEW
 @given(table=TABLES)
 def test_extreme_histograms(backend: str, table: tuple[int, list[Ray]]) -> None:
-    """As above, for weights between edges: short intervals behind long ones then have no length."""
+    """The same holds for weights between edges: short intervals behind long ones then have no length."""
     bins, rays = table
     lengths = torch.tensor([[length for _, length in ray] for ray in rays]).view(len(rays), bins)
     sigma = torch.tensor([[density for density, _ in ray] for ray in rays]).view(len(rays), bins).requires_grad_()
@@ -158,7 +158,7 @@ def test_empty_space_without_end_has_no_weight(backend: str, function: str) -> N
 @backends()
 @each_function
 def test_empty_space_without_end_learns_nothing(backend: str, function: str) -> None:
-    """Its slope would be infinite; what stands in front learns as if nothing followed."""
+    """Its slope would be infinite; samples in front learn as if nothing followed."""
     sigma = torch.tensor([1.0, 0.0], requires_grad=True)
     weights = weights_along(function, sigma, torch.tensor([0.0, 1.0, math.inf]))
     (slopes,) = torch.autograd.grad(weights.sum(), sigma)
@@ -206,7 +206,7 @@ def test_optical_depth_in_half_precision_is_cut_off_too() -> None:
 def test_half_precision_is_composited_in_single(
     backend: str, counts: list[int], dtype: torch.dtype, stride: int
 ) -> None:
-    """Densities and colours of any float type, contiguous or not, give what their values give in float32."""
+    """Densities and colours of any float type, contiguous or not, give the same as their values in float32."""
     samples, _ = packed([[(1.0, 0.5)] * count for count in counts])
     torch.manual_seed(0)
     sigma = (torch.rand(len(samples) * stride) * 6).to(dtype)[::stride]
@@ -242,7 +242,7 @@ def test_thin_samples_add_up_and_each_gets_its_gradient(backend: str, function: 
 @FEW
 @given(count=st.integers(0, 1024), exponent=st.integers(-12, -3))
 def test_thin_media_of_any_length(backend: str, count: int, exponent: int) -> None:
-    """The sum is taken in float32, one sample after another: that is what the tolerance is for."""
+    """The sum is taken in float32, one sample after another, which needs the tolerance."""
     tau = 10.0**exponent
     samples = Samples(torch.zeros(count), torch.ones(count), torch.tensor([0, count]))
     opacity = composited(samples, torch.full((count,), tau)).opacity.item()
@@ -253,7 +253,7 @@ def test_thin_media_of_any_length(backend: str, count: int, exponent: int) -> No
 @backends()
 @each_function
 def test_empty_samples_keep_all_of_the_light(backend: str, function: str) -> None:
-    """What stands behind 4,096 empty samples weighs what it weighs alone."""
+    """A sample behind 4,096 empty samples has the same weight as alone."""
     sigma = torch.cat([torch.zeros(THIN), torch.tensor([0.7])])
     weights = weights_along(function, sigma, torch.arange(THIN + 2.0))
     alone = weights_along(function, sigma[-1:], torch.tensor([0.0, 1.0]))
@@ -317,7 +317,7 @@ def test_an_empty_sample_before_a_wall_learns_whatever_rays_came_before(backend:
 @FEW
 @given(before=st.integers(0, 4), behind=st.integers(0, 4), length=st.sampled_from(FINITE))
 def test_nan_density_is_seen(backend: str, function: str, before: int, behind: int, length: float) -> None:
-    """In its own weight, however short the interval, and in all behind it; what stands in front is not touched."""
+    """It is in its own weight, however short the interval, and in all behind it; samples in front are not touched."""
     sigma = torch.tensor([1.0] * before + [math.nan] + [1.0] * behind)
     edges = torch.tensor([0.0] + [1.0] * before + [length] + [1.0] * behind).cumsum(0)
     weights = weights_along(function, sigma, edges)

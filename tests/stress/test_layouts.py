@@ -21,7 +21,7 @@ FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     **ANY_SHAPE,
     "frequencies": lambda x: frequency_encoding(x, 4),
 }
-"""What takes (N, 3)."""
+"""Functions that take (N, 3)."""
 any_function = st.sampled_from(list(FUNCTIONS))
 
 
@@ -37,7 +37,7 @@ def some(*shape: int) -> Tensor:
 def test_rows_that_do_not_stand_side_by_side(
     backend: str, name: str, count: int, stride: int, transposed: bool
 ) -> None:
-    """Value and gradient are those of a copy."""
+    """Value and gradient equal a copy's."""
     x = some(3, count).t() if transposed else some(count, 3 * stride)[:, ::stride]
     part, copy = x.detach().requires_grad_(), x.contiguous().detach().requires_grad_()
     found, truth = FUNCTIONS[name](part), FUNCTIONS[name](copy)
@@ -56,7 +56,7 @@ def test_rows_that_do_not_stand_side_by_side(
 def test_half_precision_is_right_to_its_own_rounding_or_refused(
     backend: str, name: str, count: int, dtype: torch.dtype
 ) -> None:
-    """What answers in single precision has to be as exact as that."""
+    """A result in single precision must be accurate to single precision."""
     x = some(count, 3).to(dtype)
     try:
         found = FUNCTIONS[name](x)

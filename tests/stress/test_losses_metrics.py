@@ -1,4 +1,4 @@
-"""Losses and metrics: of nothing, of mass at the far end, of planes whose sides differ, of black images."""
+"""Losses and metrics: of nothing, of mass at the far end, of planes with different sides, of black images."""
 
 import math
 import sys
@@ -56,7 +56,7 @@ def test_distortion_of_mass_at_the_far_end(backend: str, width: float) -> None:
 @backends()
 @pytest.mark.parametrize("layout", ["alone", "behind empty space", "packed"])
 def test_distortion_of_two_intervals_next_to_the_end(backend: str, layout: str) -> None:
-    """As short as float32 can make them: by hand. With w = 2^-23, slopes are 2 sum_j w_j |m_i - m_j| + 2 w_i w / 3."""
+    """They are as short as float32 can make them. With w = 2^-23, slopes are 2 sum_j w_j |m_i - m_j| + 2 w_i w / 3."""
     width, weights = 2.0**-23, torch.tensor([0.3, 0.7])
     edges = 1 - width * torch.tensor([[2.0, 1.0, 0.0]])
     if layout == "behind empty space":
@@ -151,7 +151,7 @@ def test_total_variation_of_planes_of_any_sides(height: int, width: int, feature
 
 @pytest.fixture
 def moving_planes(monkeypatch: pytest.MonkeyPatch) -> KPlanes:
-    """K-Planes in space and time, whose sides differ, and whose bands of space planes are whole."""
+    """K-Planes in space and time, with different sides, and with whole bands of space planes."""
     scene = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 4.0, 1, True, True, 8, num_times=1)
     config = KPlanesConfig(
         base_resolution=6, num_scales=2, time_resolution=5, features_per_scale=4, grid_resolution=8, num_steps=16
@@ -183,9 +183,9 @@ def variation_by_torch(table: Tensor, layout: PlanesLayout) -> tuple[Tensor, Ten
 @pytest.mark.entry(25)
 @backends()
 def test_regularisers_of_planes_in_space_and_time(backend: str, moving_planes: KPlanes) -> None:
-    """Value and gradient, wherever that waits, against float64: planes of 6 x 6, 12 x 12, 6 x 5 and 12 x 5.
+    """Value and gradient, deferred or not, against float64: planes of 6 x 6, 12 x 12, 6 x 5 and 12 x 5.
 
-    A step looks at one plane of time, and the mean over all of them is what is compared; on a GPU it looks at all.
+    A step uses one plane of time, so the mean over all of them is compared; on a GPU it uses all.
     """
     planes = moving_planes.field.encoding
     assert planes.layout.resolutions == ((6, 6, 6, 5), (12, 12, 12, 5))

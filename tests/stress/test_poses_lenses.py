@@ -27,7 +27,7 @@ def rodrigues(angle: float) -> Tensor:
 
 
 def motions(tangents: Tensor, group: str) -> Tensor:
-    """What pose refinement makes of any numbers (M, 6), as a function of them."""
+    """Motions of pose refinement for any numbers (M, 6), as a function of them."""
     refinement = PoseRefinement(len(tangents), group)  # type: ignore[arg-type]
     del refinement.tangents
     refinement.tangents = tangents
@@ -38,7 +38,7 @@ def motions(tangents: Tensor, group: str) -> Tensor:
 @pytest.mark.parametrize("group", ["SO3xR3", "SE3"])
 @pytest.mark.parametrize("angle", [0.0, 1e-30, 1e-12, 1e-8, 1e-4, 1.0, math.pi, 6.0])
 def test_rotations_by_any_angle(angle: float, group: str) -> None:
-    """Against Rodrigues in float64, whose quotients 0 / 0 are written out; gradients against finite differences."""
+    """The truth is Rodrigues' formula in float64, with limits for 0 / 0, and finite differences for gradients."""
     tangents = torch.cat([torch.zeros(3, dtype=torch.float64), AXIS * angle])[None]
     exact, rounded = (motions(t, group)[0, :, :3] for t in (tangents, tangents.float()))
     torch.testing.assert_close(exact, rodrigues(angle), rtol=0, atol=1e-12)
@@ -62,7 +62,7 @@ def test_the_gradient_of_no_rotation_in_closed_form(group: str) -> None:
 @pytest.mark.entry(18)
 @pytest.mark.parametrize("short_of", [None, 1e-12, 1e-6, 1e-5, 1e-4, 1e-3, 1.0, 0.0])
 def test_the_smallest_rotation_between_directions(short_of: float | None) -> None:
-    """From one direction to the same, to almost the opposite (`short_of` half a turn), and to the opposite."""
+    """It goes from one direction to the same, to almost the opposite (`short_of` half a turn), or to the opposite."""
     angle = 0.0 if short_of is None else math.pi - short_of
     start = torch.tensor([1.0, 2.0, -2.0], dtype=torch.float64) / 3
     across = torch.tensor([2.0, 1.0, 2.0], dtype=torch.float64) / 3

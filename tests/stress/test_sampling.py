@@ -30,7 +30,7 @@ HISTOGRAMS = st.tuples(st.integers(1, 6), st.integers(0, 3)).flatmap(
         st.lists(st.lists(BIN, min_size=shape[0], max_size=shape[0]), min_size=shape[1], max_size=shape[1]),
     )
 )
-"""How many bins a ray has, and those of each ray."""
+"""Number of bins of a ray, and the bins of each ray."""
 
 Bins = list[tuple[float, float]]
 
@@ -45,7 +45,7 @@ def histogram(bins: int, rays: list[Bins]) -> tuple[Tensor, Tensor]:
 
 
 def mass_below(edges: list[float], masses: list[float], x: float) -> tuple[float, float]:
-    """Bounds of the mass below x: they differ by that of bins without width which stand at x."""
+    """Bounds of the mass below x: they differ by the mass of bins without width at x."""
     low = high = 0.0
     for left, right, mass in zip(edges[:-1], edges[1:], masses, strict=True):
         share = min(max((x - left) / (right - left), 0.0), 1.0) if right > left else None
@@ -55,7 +55,7 @@ def mass_below(edges: list[float], masses: list[float], x: float) -> tuple[float
 
 
 def assert_quantiles(edges: list[float], masses: list[float], found: list[float], shares: list[float]) -> None:
-    """As much of the mass lies below each of what was found as the shares say, and all lies within the edges."""
+    """Check that the mass below each found position equals its share, and that all lie within the edges."""
     total = math.fsum(masses)
     for x, share in zip(found, shares, strict=True):
         assert edges[0] <= x <= edges[-1]
@@ -95,7 +95,7 @@ def test_new_intervals_of_any_histogram(
     strided=st.booleans(),
 )
 def test_points_of_any_histogram(table: tuple[int, list[Bins]], u: list[float], strided: bool) -> None:
-    """u = 0 and u = 1 are the ends of what has mass; without weight all bins are alike."""
+    """u = 0 and u = 1 are the ends of the mass; without weight all bins are alike."""
     edges, weights = histogram(*table)
     places = torch.tensor(u).expand(len(edges), len(u))
     if strided:

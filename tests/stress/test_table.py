@@ -1,4 +1,4 @@
-"""The table itself: that every entry has tests, and that it says what happened."""
+"""The table itself: every entry has tests, and it reports their results."""
 
 import re
 from pathlib import Path

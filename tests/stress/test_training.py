@@ -1,4 +1,4 @@
-"""Training through what ruins it: no density, no samples, infinite gradients, NaN pictures, long runs."""
+"""Training through ruinous conditions: no density, no samples, infinite gradients, NaN pictures, long runs."""
 
 import dataclasses
 import math
@@ -31,7 +31,7 @@ from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 BETAS = (0.9, 0.99)
 EPSILONS = [1e-7, 1e-8, 1e-12, 1e-15]
-"""Those that methods use."""
+"""Epsilons that methods use."""
 
 
 # -- Adam ---------------------------------------------------------------------------------------------------------
@@ -40,7 +40,7 @@ EPSILONS = [1e-7, 1e-8, 1e-12, 1e-15]
 @pytest.mark.entry(2)
 @pytest.mark.parametrize("kind", ["instant-ngp", "vanilla-nerf"])
 def test_weights_and_moments_are_float32_under_mixed_precision(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
-    """Half precision would round an epsilon of 1e-8, and most of what a step adds, to 0."""
+    """Half precision would round an epsilon of 1e-8, and most changes of a step, to 0."""
     trainer = tiny_trainer(kind, shared_tiny, tmp_path / "run", mixed_precision=True)
     trainer.train_step()
     kept = [*trainer.model.parameters()]
@@ -129,7 +129,7 @@ def test_counts_and_means_after_a_hundred_thousand_steps() -> None:
 @pytest.mark.entry(6)
 @backends()
 def test_a_step_with_an_infinite_gradient_is_dropped(backend: str, shared_tiny: Path, tmp_path: Path) -> None:
-    """There is no gradient scaler whose checks could be skipped: the step itself looks."""
+    """There is no gradient scaler, so its checks cannot be skipped: the step itself checks."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     trainer.train_step()
     weight = trainer.model.field.density_head[0].weight
@@ -149,7 +149,7 @@ def test_a_step_with_an_infinite_gradient_is_dropped(backend: str, shared_tiny: 
 @backends()
 @pytest.mark.parametrize("factor", [1.0, 0.0, math.inf, -math.inf, math.nan])
 def test_an_infinite_gradient_that_waits_for_the_optimiser_is_found(backend: str, factor: float) -> None:
-    """A table's gradient is not added up before the step; what it will be made of is looked at."""
+    """A table's gradient is not added up before the step; its parts are checked."""
     grid = HashGrid(2, 2, 4, 8, 8, sparse=True)
     assert grid.deferred is not None
     optimizer = Adam([{"params": [grid.table], "sparse": True}], {grid.table: grid.deferred}, 1e-2, BETAS, 1e-15)
@@ -213,7 +213,7 @@ def test_no_rays_make_an_empty_picture(kind: str, shared_tiny: Path, tmp_path: P
 
 
 def looking_inwards(count: int) -> Rays:
-    """From a sphere of radius 3 to near the origin."""
+    """Rays from a sphere of radius 3 to near the origin."""
     origins = 3 * nn.functional.normalize(torch.randn(count, 3), dim=-1)
     directions = nn.functional.normalize(torch.rand(count, 3) - 0.5 - origins, dim=-1)
     return Rays(origins, directions, torch.full((count,), 1.5), torch.full((count,), 4.5))

@@ -1,4 +1,4 @@
-"""instant-ngp that shows NaN in batches of few rays: what a broken plugin does."""
+"""instant-ngp with NaN in batches of few rays, as a broken plugin."""
 
 import math
 from dataclasses import dataclass, replace

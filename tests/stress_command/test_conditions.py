@@ -96,7 +96,7 @@ def test_short_runs_take_small_steps() -> None:
 
 
 def stressed(run: Run, condition: Condition) -> Trainer:
-    """A trainer on the ball, of whose batches the condition is made."""
+    """A trainer on the ball with batches under the condition."""
     create_folder(run)
     source = StressedSource(make_source("pixels", BALL.train, run.config), condition)
     return Trainer(load_method(run.method), run.config, BALL.train, source=source)
@@ -104,7 +104,7 @@ def stressed(run: Run, condition: Condition) -> Trainer:
 
 @pytest.mark.parametrize(("name", "rays"), [("1-ray", 1), ("8192-rays", 8192)])
 def test_a_step_has_so_many_rays(name: str, rays: int, tmp_path: Path) -> None:
-    """Also of a method whose rays follow its samples, and which sends four through a pixel."""
+    """This includes a method with rays that follow its samples, and four rays through a pixel."""
     run, condition = tiny_run("instant-ngp", Path("none"), tmp_path, train_rays_per_pixel_from=0.0), BY_NAME[name]
     trainer = stressed(replace(run, config=from_plain(run.config, condition.settings(run.config), name)), condition)
     trainer.train_step()

@@ -1,4 +1,4 @@
-"""What is written about a run of several methods."""
+"""The report on a run of several methods."""
 
 import json
 from pathlib import Path

@@ -23,7 +23,7 @@ BALL = ball_views()
 BUDGET = Budget(steps=75, seconds=None)
 SICK = " ".join(["sick", *TINY_NGP])
 WITHOUT_ALPHA = {"gaussian-splatting": {"start": "auto"}, "moving-gaussians": {"start": "auto"}}
-"""Settings of tiny runs that suit images without alpha too, as those of some conditions."""
+"""Settings of tiny runs that suit images without alpha too, which some conditions have."""
 
 
 @pytest.mark.medium

@@ -1,4 +1,4 @@
-"""The scenes of the stress suite: the ball's pictures are what geometry says, and data is reduced as it should be."""
+"""The scenes of the stress suite: the ball's pictures agree with geometry, and data is reduced correctly."""
 
 import math
 from dataclasses import replace
@@ -102,7 +102,7 @@ def test_the_ball_takes_its_share_of_a_picture(field_of_view: float) -> None:
 
 @pytest.mark.parametrize(("field_of_view", "distance"), LOOKS[:3])
 def test_the_middle_of_a_picture_has_the_colour_of_its_normal(field_of_view: float, distance: float | None) -> None:
-    """From outside the nearest point's, from inside that of the wall across."""
+    """It is the nearest point's from outside, and the opposite wall's from inside."""
     dataset = views_of(field_of_view, distance).train
     for index, pose in enumerate(dataset.cameras.camera_to_worlds):
         normal = pose[:, 2] if distance is None else -pose[:, 2]

@@ -29,7 +29,7 @@ BALL = ball_views()
 
 
 def consistent(dataset: Dataset) -> None:
-    """What a data set says of itself fits together."""
+    """Check that the facts of a data set agree with each other."""
     count = len(dataset.cameras)
     assert len(dataset.pixels) == int(dataset.cameras.offsets[-1])
     assert len(dataset.names) == dataset.scene.num_cameras == count
@@ -115,7 +115,7 @@ def test_chosen_photographs_keep_their_masks_and_times() -> None:
 
 
 def in_box(dataset: Dataset) -> torch.Tensor:
-    """(M, 3) the cameras' places in units of the box, from its corner: what no similarity changes."""
+    """(M, 3) the cameras' places in units of the box, from its corner: no similarity changes these."""
     box = dataset.scene.box.double()
     return (dataset.cameras.camera_to_worlds[:, :, 3].double() - box[0]) / (box[1] - box[0])
 

@@ -1,4 +1,4 @@
-"""What is made of a run's figures."""
+"""The verdict on a run's figures."""
 
 import math
 

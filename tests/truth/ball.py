@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 CENTRE, RADIUS = np.array([0.4, -0.3, 0.7]), 0.5
-"""Of the ball, in the capture's own frame and unit (metres)."""
+"""Centre and radius of the ball, in the capture's own frame and unit (metres)."""
 WIDTH, HEIGHT = 48, 40
 INTRINSICS = (70.0, 73.0, 23.1, 20.7)
 """fx, fy, cx, cy in pixels; the first pixel's centre is at 0.5."""
@@ -23,7 +23,7 @@ NAMES = [f"{index:03d}.png" for index in range(COUNT)]
 HELD_OUT = [NAMES[0], NAMES[8]]
 """Every eighth by name."""
 WAVES = np.array([[19.0, 3.0, 5.0], [4.0, 17.0, -6.0], [-5.0, 7.0, 18.0]])
-"""Of the pattern: radians a metre, for each channel."""
+"""Waves of the pattern: radians a metre, for each channel."""
 
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "k7", "p1", "p2")
@@ -36,7 +36,7 @@ class Lens:
     model: str = "pinhole"
     """pinhole, opencv or fisheye."""
     named: dict[str, float] = field(default_factory=dict)
-    """k1 to k7 and p1, p2, k7 being the numerator's r^8; what is not named is 0."""
+    """k1 to k7 and p1, p2, with k7 for the numerator's r^8; the others are 0."""
     intrinsics: tuple[float, float, float, float] = INTRINSICS
 
     def bend(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,9 +102,9 @@ def opencv_pose(index: int) -> np.ndarray:
 
 
 def met(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What rays (R, 3) with unit directions meet: colours (R, 3) in [0, 1], distances (R,), and how surely (R,).
+    """Colours (R, 3) in [0, 1], distances (R,) and margins (R,) of rays (R, 3) with unit directions.
 
-    Surely is by how much, in radii squared, a ray passes within the ball; below 0 it misses: the rest means nothing.
+    The margin is positive, in squared radii, if a ray meets the ball; otherwise the other values mean nothing.
     """
     towards = CENTRE - origins
     along = (towards * directions).sum(-1)
@@ -123,7 +123,7 @@ PINHOLE = Lens()
 
 
 def photograph(index: int, lens: Lens = PINHOLE) -> np.ndarray:
-    """(HEIGHT, WIDTH, 4) uint8: the ball, and nothing around it. What is transparent has a colour that misleads."""
+    """(HEIGHT, WIDTH, 4) uint8: the ball, and nothing around it. Transparent pixels have a misleading colour."""
     pose = pose_of(index)
     directions = looks(pose, lens)
     colors, _, surely = met(np.broadcast_to(pose[:3, 3], directions.shape), directions)
@@ -141,7 +141,7 @@ def depth(index: int, lens: Lens = PINHOLE) -> np.ndarray:
 
 
 def write_photographs(folder: Path, names: list[str], lens: Lens = PINHOLE) -> None:
-    """From all places, under these names."""
+    """Write the photographs from all places, under these names."""
     folder.mkdir(parents=True, exist_ok=True)
     for index, name in enumerate(names):
         Image.fromarray(photograph(index, lens)).save(folder / name)

@@ -39,7 +39,7 @@ from tests.truth.ball import (
 )
 
 MIDDLE = Lens(intrinsics=(70.0, 70.0, WIDTH / 2, HEIGHT / 2))
-"""What formats with a single focal length can say."""
+"""A lens for formats with a single focal length."""
 BENT = Lens("opencv", {"k1": -0.11, "k2": 0.05, "p1": 0.012, "p2": -0.008})
 RATIONAL = Lens(
     "opencv",
@@ -51,7 +51,7 @@ APPLIED = np.eye(4)
 APPLIED[:3, :3] = Rotation.from_rotvec([0.4, -0.7, 0.3]).as_matrix()
 APPLIED[:3, 3] = (0.3, 0.8, -0.5)
 APPLIED_SCALE = 0.4
-"""From the capture's own frame to that of a file which says so: APPLIED_SCALE * (APPLIED @ x)."""
+"""From the capture's own frame to a file's that states it: APPLIED_SCALE * (APPLIED @ x)."""
 
 
 def applied(pose: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ def applied(pose: np.ndarray) -> np.ndarray:
 
 
 def write_nerfstudio(folder: Path, lens: Lens = PINHOLE, **changes: Any) -> Path:
-    """In another frame and unit than the capture's, which the file tells; depth is in the capture's millimetres."""
+    """The file states its frame and unit, which differ from the capture's; depth is in the capture's millimetres."""
     write_photographs(folder / "images", NAMES, lens)
     write_depths(folder / "depth", NAMES, lens)
     model, named = {"pinhole": "PINHOLE", "opencv": "OPENCV", "fisheye": "OPENCV_FISHEYE"}[lens.model], dict(lens.named)
@@ -89,7 +89,7 @@ def write_nerfstudio(folder: Path, lens: Lens = PINHOLE, **changes: Any) -> Path
 
 
 def model_of(names: list[str] = NAMES) -> Capture:
-    """What COLMAP would have found."""
+    """The model that COLMAP would have found."""
     poses = np.stack([opencv_pose(index) for index in range(COUNT)])
     return Capture(names, poses[:, :, :3], poses[:, :, 3], surface())
 
@@ -204,7 +204,7 @@ def write_dtu(folder: Path) -> Path:
 
 
 def write_sdfstudio(folder: Path) -> Path:
-    """In another frame and unit than the capture's, which the file tells; depth is in the file's."""
+    """The file has another frame and unit than the capture's, and states them; depth is in the file's."""
     write_photographs(folder, NAMES)
     fx, fy, cx, cy = PINHOLE.intrinsics
     frames = []

@@ -1,4 +1,4 @@
-"""A capture whose truth is known, in every format: pixels, depths, bounds and splits after it has been read."""
+"""A capture with a known truth, in every format: pixels, depths, bounds and splits after it has been read."""
 
 import json
 from dataclasses import replace
@@ -37,7 +37,7 @@ def in_own_frame(scene: ParsedScene, rays: Rays) -> tuple[np.ndarray, np.ndarray
 
 
 def assert_pixels_show_the_ball(scene: ParsedScene, steps: float | None) -> Dataset:
-    """Every pixel has the colour, the alpha and the depth of what its ray meets."""
+    """Check that every pixel has the colour, the alpha and the depth of its ray's first hit."""
     data = load_dataset(scene, "a")
     for index in range(len(data)):
         pixels = data.cameras.image_pixels(index)
@@ -113,7 +113,7 @@ def test_a_scale_is_one_of_all_lengths(name: str, tmp_path: Path) -> None:
 
 
 def test_the_word_for_held_out_photographs_is_looked_for_in_their_own_names(tmp_path: Path) -> None:
-    """Of a folder called latest/ all would be held out."""
+    """All photographs in a folder called latest/ would be held out."""
     folder = write_nerfstudio(tmp_path / "valley")
     (folder / "images").rename(folder / "latest")
     (folder / "latest" / NAMES[3]).rename(folder / "latest" / f"eval_{NAMES[3]}")
@@ -141,7 +141,7 @@ def test_a_depth_image_of_another_size_gives_what_is_at_the_pixels_middle(
 
 
 def test_points_behind_a_camera_do_not_say_where_its_rays_begin() -> None:
-    """A camera at the origin that looks along -z: what is right behind it is not what it shows."""
+    """A camera at the origin that looks along -z: it does not show points right behind it."""
     numbers = torch.full((1,), 50.0)
     camera = Cameras(torch.eye(4)[None, :3], numbers, numbers, numbers / 2, numbers / 2, numbers.long(), numbers.long())
     ahead, behind = torch.tensor([[0.0, 0.0, -4.0]]).repeat(9, 1), torch.tensor([[0.0, 0.0, 0.1]]).repeat(9, 1)
@@ -159,7 +159,7 @@ def test_what_goes_with_a_photograph_goes_with_it_where_others_are_missing(tmp_p
     (folder / "images" / NAMES[5]).write_bytes(b"no picture")
     scene = Nerfstudio().parse(folder, "train")
     data = load_dataset(scene, "train")
-    # Every eighth of those whose files are there.
+    # Every eighth of the existing files.
     there = [name for name in NAMES if name != NAMES[2]]
     assert list(data.names) == [name for name in there if name not in (there[0], there[8], NAMES[5])]
     assert data.times is not None

@@ -1,4 +1,4 @@
-"""Colours and opacity from the file to the batch and to what is judged: straight alpha, multiplied once."""
+"""Colours and opacity from the file to the batch and to the judged images: straight alpha, multiplied once."""
 
 import json
 from dataclasses import replace
@@ -72,7 +72,7 @@ def test_stored_colours_are_straight_and_a_batch_shows_them_over_its_background(
 def test_a_photograph_with_alpha_is_judged_over_white_and_one_without_over_black(
     shared_tiny: Path, tmp_path: Path
 ) -> None:
-    """As they are trained on; or as was asked for."""
+    """The background is the one of training, or the given one."""
     for has_alpha, asked, expected in (
         (True, "auto", 1.0),
         (False, "auto", 0.0),
@@ -97,7 +97,7 @@ def test_what_is_judged_of_a_photograph_with_alpha_is_how_it_looks_over_white(fo
 
 
 def cut_out(tiny: Path, grey: int = 255) -> Path:
-    """The tiny ball as a capture whose masks cut it out, wholly opaque photographs and all."""
+    """The tiny ball as a capture with masks that cut it out, and with opaque photographs."""
     names = []
     for file in sorted(tiny.rglob("*.png")):
         rgba = np.asarray(Image.open(file))
@@ -124,7 +124,7 @@ def cut_out(tiny: Path, grey: int = 255) -> Path:
 
 @pytest.fixture
 def run(tiny: Path, tmp_path: Path) -> Run:
-    """Of instant-ngp on the cut-out ball."""
+    """A run of instant-ngp on the cut-out ball."""
     from nerfloom.dataparsers.nerfstudio import Nerfstudio
 
     made = tiny_run("instant-ngp", cut_out(tiny), tmp_path / "run")
@@ -147,7 +147,7 @@ def test_masks_that_cut_an_object_out_mean_emptiness_in_training_and_nothing_in_
     assert not bool((batch.rgb[kept] == 0.25).all(-1).any())
     assert train.kept is None
     assert train.drawn is None
-    # Whatever masks mean in training, evaluation is of what they keep, of photographs that are opaque.
+    # For any meaning of masks in training, evaluation uses the pixels that they keep, in opaque photographs.
     assert (test.opaque, test.scene.has_alpha) == (None, False)
     for index, name in enumerate(test.names):
         judged = test.kept_of(index)

@@ -1,4 +1,4 @@
-"""A comparison's figures and rules: what is called the best is the best, and what is repeated has another seed."""
+"""A comparison's figures and rules: the best run is named best, and repeats have other seeds."""
 
 import json
 from dataclasses import replace
@@ -17,7 +17,7 @@ BETTER = {
     "Chamfer, % of side": 0.1, "F-score, %": 90.0, "normals, °": 5.0, "faces": 900, "normals of views, °": 6.0,
     "steps": 2000, "training, rays/s": 3e5, "rendering, s/image": 0.2, "peak memory, GiB": 2**29, "parameters": 1000,
 }  # fmt: skip
-"""Of each column: by what PSNR and its like mean, not by what the report thinks."""
+"""Better values of each column, from the meaning of the metric, not from the report."""
 WORSE = {
     "PSNR, dB": 30.0, "SSIM": 0.9, "MS-SSIM": 0.93, "LPIPS (alex)": 0.1, "floaters, %": 2.0, "training, s": 60.0,
     "Chamfer, % of side": 0.2, "F-score, %": 80.0, "normals, °": 9.0, "faces": 100, "normals of views, °": 8.0,
@@ -74,7 +74,7 @@ def test_the_better_figure_of_every_column_is_called_the_best(tmp_path: Path) ->
 
 
 def test_repeats_are_runs_of_other_seeds_in_other_folders(tmp_path: Path) -> None:
-    """As ns-train itself reads the commands."""
+    """ns-train itself parses the commands."""
     all_planned = plan(tmp_path, "kplanes", "instant-ngp --num-levels 3", repeats=3).runs()
     runs = [run_of(*_method_and_flags(planned)) for planned in all_planned]
     assert [run.config.machine.seed for run in runs] == [42, 42, 43, 43, 44, 44]

@@ -1,4 +1,4 @@
-"""Exports of what a run has made of its input: refined cameras, and points that are where half of the light is gone."""
+"""Exports of a run: refined cameras, and points where half of the light is gone."""
 
 import json
 from dataclasses import replace
@@ -28,7 +28,7 @@ CHANNELS = ("red", "green", "blue")
 
 
 def generator(vector: np.ndarray) -> np.ndarray:
-    """(3, 3) what a rotation vector is the exponential of."""
+    """(3, 3) the generator of a rotation vector."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
@@ -43,7 +43,7 @@ def untrained(tmp_path: Path) -> Trainer:
 
 
 def test_a_checkpoint_tells_where_its_scene_lies_in_the_captures_frame(untrained: Trainer) -> None:
-    """By its transform and scale, with which every export begins, cameras stand where photographs were taken."""
+    """Its transform and scale, which start every export, put cameras where photographs were taken."""
     content = load_checkpoint(untrained.save())
     transform, scale = np.array(content["transform"]), content["scale"]
     places = untrained.train_set.cameras.camera_to_worlds[:, :, 3].double().numpy()
@@ -54,7 +54,7 @@ def test_a_checkpoint_tells_where_its_scene_lies_in_the_captures_frame(untrained
 
 
 def test_refined_cameras_are_exported_where_they_are_believed_to_be(untrained: Trainer, tmp_path: Path) -> None:
-    """In the device's frame and metres, each with the motion in the scene that was learnt for it."""
+    """They are in the device's frame and metres, each with the motion in the scene that was learnt for it."""
     tangents = 0.1 * torch.randn(COUNT - len(HELD_OUT), 6, generator=torch.Generator().manual_seed(0))
     untrained.model.load_state_dict({"poses.tangents": tangents}, strict=False)
     untrained.save()
@@ -72,7 +72,7 @@ def test_refined_cameras_are_exported_where_they_are_believed_to_be(untrained: T
 def test_exported_points_normals_and_colours_are_in_the_captures_frame(
     untrained: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a run that finds the ball, in its scene's frame and unit: a point is its normal times the radius away."""
+    """The run finds the ball, in its scene's frame and unit: a point is its normal times the radius away."""
     truth = surface(50)
     normals = (truth - CENTRE) / RADIUS
     transform, scale = untrained.train_set.transform.double().numpy(), untrained.train_set.scale
@@ -97,8 +97,8 @@ def test_exported_points_normals_and_colours_are_in_the_captures_frame(
 def test_points_are_where_half_of_the_light_is_gone_and_within_reach_of_the_box(
     reach: float | None, shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a picture that is told: median and mean depth apart, a box that is not around the origin, normals and colours
-    that go with their points."""
+    """The picture is given: median and mean depth differ, the box is not around the origin, normals and colours belong
+    to their points."""
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run")
     model = trainer.model.eval()
     middle, half = torch.tensor([0.3, -0.2, 0.4]), torch.tensor([1.0, 0.8, 1.2])
@@ -121,7 +121,7 @@ def test_points_are_where_half_of_the_light_is_gone_and_within_reach_of_the_box(
     if reach is None:
         assert len(found.positions) == 4 * 3000 // 5
     else:
-        # As many as lie there, of rays that all go on for 3 to 5 from cameras at 4 from the origin.
+        # All points there, of rays that all go on for 3 to 5 from cameras at 4 from the origin.
         every = joined(surface_points(model, trainer.train_set, 3000, None)).positions
         share = ((every - middle).abs() <= reach * half).all(-1).double().mean()
         assert len(found.positions) / (4 * 3000 / 5) == pytest.approx(float(share), abs=0.04)

@@ -1,7 +1,7 @@
-"""Wide lenses on the way from COLMAP to rays: read as they are, and by way of what ns-process-data writes.
+"""Wide lenses on the way from COLMAP to rays: read directly, and by way of the files of ns-process-data.
 
-So wide that every coefficient moves the picture's edge by a tenth of a pixel or more: one that is lost, or stands in
-the place of another, shows. Rays are held against OpenCV's formulas, undone by iteration (`ball.Lens`).
+So wide that every coefficient moves the picture's edge by a tenth of a pixel or more: a lost or exchanged coefficient
+shows. Rays are compared with OpenCV's formulas, undone by iteration (`ball.Lens`).
 """
 
 import json
@@ -41,7 +41,7 @@ def wide(model: str) -> Lens:
 
 
 def assert_rays_are_the_lens(scene: ParsedScene, lens: Lens) -> None:
-    """Those of all pixels of the first and the last photograph, in the capture's own frame."""
+    """Check the rays of all pixels of the first and the last photograph, in the capture's own frame."""
     assert [path.name for path in scene.image_paths] == NAMES
     for index in (0, len(NAMES) - 1):
         rays = scene.cameras.pixel_rays(scene.cameras.image_pixels(index), 0.0, 1.0)
@@ -93,7 +93,7 @@ def test_colmaps_cameras_as_they_are_written_and_read(model: str, tmp_path: Path
 )
 @pytest.mark.parametrize("each", [False, True])
 def test_a_file_of_nerfstudio(model: str, names: dict[str, str], each: bool, tmp_path: Path) -> None:
-    """Coefficients for all photographs, or with each; of OPENCV the fourth is that of r^8."""
+    """Coefficients are for all photographs, or with each; the fourth of OPENCV belongs to r^8."""
     values, kind = (FISHEYE, "fisheye") if model == "OPENCV_FISHEYE" else (BENDING, "opencv")
     lens = Lens(kind, {name: values[name] for name in names}, WIDE)
     written = {written: values[name] for name, written in names.items()}

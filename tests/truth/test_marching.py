@@ -1,7 +1,7 @@
-"""Marching through grids that are nearly empty: each form finds every step whose middle lies in an occupied cell.
+"""Marching through grids that are nearly empty: each form finds every step with its middle in an occupied cell.
 
-Against brute force in float64. Distances to what is occupied are long there, so that a map of them which is wrong along
-one axis lets rays pass over what they should meet.
+The truth is brute force in float64. Distances to occupied cells are long there, so a map of distances with an error
+along one axis lets rays pass over cells that they should meet.
 """
 
 from itertools import product
@@ -36,7 +36,7 @@ def occupied(kind: str) -> np.ndarray:
 
 
 def rays_towards(cells: np.ndarray) -> Rays:
-    """From all around, each through some place of an occupied cell."""
+    """Rays from all around, each through a point of an occupied cell."""
     random = np.random.default_rng(0)
     chosen = np.argwhere(cells)[random.integers(0, cells.sum(), COUNT)]
     targets = BOX[0] + (chosen + random.random((COUNT, 3))) / RESOLUTION * (BOX[1] - BOX[0])
@@ -59,7 +59,7 @@ def held(cells: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def middles_by_brute_force(rays: Rays, cells: np.ndarray) -> list[np.ndarray]:
-    """Of each ray the distances of the steps' middles that lie in an occupied cell, and not on its faces."""
+    """For each ray the distances of the steps' middles that lie in an occupied cell, and not on its faces."""
     origins, directions = rays.origins.double().numpy(), rays.directions.double().numpy()
     ends = (BOX[:, None] - origins) / directions
     enter, leave = ends.min(0).max(-1), ends.max(0).min(-1)

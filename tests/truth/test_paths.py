@@ -1,4 +1,4 @@
-"""ns-render: which cameras, at which times and sizes, are rendered, and how long their pictures are shown."""
+"""ns-render: cameras, times and sizes of the rendered pictures, and the duration of each."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ FRAMES = 5
 
 @pytest.fixture
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """What each picture was asked to show; each picture is of another grey."""
+    """The request of each picture; each picture has another grey."""
     asked: list[dict[str, Any]] = []
 
     def render_view(model: Any, view: View, background: Tensor) -> Picture:

@@ -1,4 +1,4 @@
-"""A capture whose truth is known, through ns-process-data: what is written shows the same ball, in the same frame."""
+"""A capture with a known truth, through ns-process-data: its files show the same ball, in the same frame."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ from tests.truth.formats import COLMAP_CAMERAS, camera_line, model_of, write_pol
 from tests.truth.test_captures import assert_pixels_show_the_ball, in_own_frame
 
 WRITABLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
-"""COLMAP's models that transforms.json has a place for, of those that ns-process-data fits."""
+"""COLMAP's models that ns-process-data fits and transforms.json has a place for."""
 EVERY = Nerfstudio(eval_mode="all")
 
 
@@ -49,7 +49,7 @@ def process(kind: str, data: Path, output: Path, *flags: object) -> dict[str, An
 
 
 def without_colmap(monkeypatch: pytest.MonkeyPatch, camera: str, order: list[str]) -> None:
-    """COLMAP finds what is true, at once: the poses, the lens and points of the ball.
+    """COLMAP finds the truth at once: the poses, the lens and points of the ball.
 
     Args:
         order: names that the photographs have been given.
@@ -87,7 +87,7 @@ def test_photographs_with_the_poses_and_the_lens_that_colmap_finds(
     turn, move = scene.transform[:, :3].double().numpy(), scene.transform[:, 3].double().numpy()
     points = (scene.points.double().numpy() / scene.scale - move) @ turn
     np.testing.assert_allclose(np.linalg.norm(points - CENTRE, axis=-1), RADIUS, rtol=1e-5)
-    # In the file's own frame z is up, as COLMAP's -y is.
+    # The file's own frame has z up, as COLMAP's has -y.
     expected = model_of().points[:, [0, 2, 1]] * [1, 1, -1]
     stored = read_points(output / "sparse_pc.ply").numpy()
     np.testing.assert_allclose(stored[stored[:, 0].argsort()], expected[expected[:, 0].argsort()], atol=1e-6)

@@ -1,4 +1,4 @@
-"""With refined poses, everything is in the frame of the learnt scene: that of a ball whose given poses are off."""
+"""With refined poses, everything is in the frame of the learnt scene: a ball with given poses that are off."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -79,7 +79,7 @@ def colors_of(normals: Tensor) -> Tensor:
 
 
 def moved_back(poses: Tensor) -> Tensor:
-    """Poses (M, 3, 4) from which the motion leads to the given ones."""
+    """Poses (M, 3, 4) that the motion maps to the given ones."""
     motion = rigid_motions(MOTION[None].double(), True)[0]
     turn, shift = motion[:, :3].T, motion[:, 3]
     found = poses.double().clone()
@@ -95,7 +95,7 @@ def true() -> Dataset:
 
 @pytest.fixture
 def loaded(true: Dataset, monkeypatch: pytest.MonkeyPatch) -> Loaded:
-    """A run on the same images, whose data have the cameras elsewhere."""
+    """A run on the same images, with cameras elsewhere in the data."""
     wrong = moved_back(true.cameras.camera_to_worlds)
     assert float((wrong - true.cameras.camera_to_worlds).abs().max()) > 0.5
     cameras = replace(true.cameras, camera_to_worlds=wrong)
@@ -126,7 +126,7 @@ def assert_true(cameras: Cameras, true: Dataset) -> None:
 
 
 def test_cameras_stand_where_the_images_were_taken(loaded: Loaded, true: Dataset) -> None:
-    """Those of training images by their own motion, and others by that of the training cameras around them."""
+    """Training cameras have their own motion, and others follow the training cameras around them."""
     for split in ("train", "test"):
         assert_true(loaded.dataset(split).cameras, true)  # type: ignore[arg-type]
         assert_true(loaded.parsed(split).cameras, true)  # type: ignore[arg-type]
@@ -185,7 +185,7 @@ def test_meshes_lie_on_the_ball(kind: str, loaded: Loaded) -> None:
 
 
 def test_lengths_are_those_of_the_ball(loaded: Loaded, true: Dataset) -> None:
-    """Between what two photographs show in their middle, which is the nearest place to each camera."""
+    """The length is between the middles of two photographs, which show the nearest places to the cameras."""
     ends = []
     for index in (1, 3):
         end = loaded.pick(loaded.dataset("train").view(index), SIZE / 2 - 0.5, SIZE / 2 - 0.5)
@@ -197,7 +197,7 @@ def test_lengths_are_those_of_the_ball(loaded: Loaded, true: Dataset) -> None:
 
 
 def test_training_moves_rays_and_rendering_does_not(shared_tiny: Path, tmp_path: Path) -> None:
-    """A loss is that of rays from the refined cameras; rays that are rendered are in the scene's frame already."""
+    """A loss uses rays from the refined cameras; rendered rays are in the scene's frame already."""
     trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path / "run", sampler="proposal", camera_optimizer="SE3")
     model: Any = trainer.model.eval()
     torch.manual_seed(0)

@@ -1,4 +1,4 @@
-"""A capture whose truth is known, trained on, judged and exported by the commands: every number against what it is."""
+"""A capture with a known truth, trained on, judged and exported by the commands: every number against the truth."""
 
 import json
 from pathlib import Path
@@ -43,7 +43,7 @@ def trained(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read_cloud(file: Path) -> np.ndarray:
-    """A PLY file's vertices as a structured array, by what its header says."""
+    """A PLY file's vertices as a structured array, by its header."""
     header, body = file.read_bytes().split(b"end_header\n", 1)
     kinds = {"float": "<f4", "uchar": "u1"}
     rows = [line.split() for line in header.decode().splitlines() if line.startswith("property")]
@@ -52,7 +52,7 @@ def read_cloud(file: Path) -> np.ndarray:
 
 @pytest.mark.medium
 def test_points_lie_on_the_ball_with_its_normals_and_colours(trained: Path, tmp_path: Path) -> None:
-    """In the capture's own frame and unit, which are neither the file's nor the scene's."""
+    """They are in the capture's own frame and unit, which are neither the file's nor the scene's."""
     command(
         "ns-export", "pointcloud", "--load-config", trained / "config.yml", "--output-dir", tmp_path,
         "--num-points", 20_000,

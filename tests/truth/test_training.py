@@ -1,4 +1,4 @@
-"""Against closed forms: the learning rate by the clock, where rays end in each mode, and what light is fitted to."""
+"""Closed forms of training: the learning rate by the clock, the ends of rays in each mode, and the fit of light."""
 
 import dataclasses
 import math
@@ -45,7 +45,7 @@ SCENE = Scene(BOX, 0.0, 10.0, 3, True, False, 20)
 def test_the_rate_falls_over_the_budget_that_is_further_spent(
     schedule: Any, step: int, seconds: float, shared_tiny: Path, tmp_path: Path
 ) -> None:
-    """Of 100 seconds and 1000 steps. Every headline figure is made with a budget of seconds."""
+    """The budgets are 100 seconds and 1000 steps. Every headline figure is made with a budget of seconds."""
     trainer = tiny_trainer(
         "instant-ngp", shared_tiny, tmp_path / "run", max_seconds=100.0, max_num_iterations=1000, lr_schedule=schedule,
         learning_rate=0.02, lr_final=0.05, silhouette_cells=False, samples_per_batch=256,
@@ -100,7 +100,7 @@ class Fog(Field):
 
 @pytest.mark.parametrize(("training", "stop"), [(False, 1e-4), (True, 1e-2)])
 def test_rays_end_where_the_mode_says(training: bool, stop: float) -> None:
-    """By what `--early-stop` and `--train-early-stop` are said to be, through the settings."""
+    """`--early-stop` and `--train-early-stop` define the ends, through the settings."""
     method = load_method("instant-ngp")
     config, _ = method.decided(dataclasses.replace(method.config, early_stop=1e-4, train_early_stop=1e-2), SCENE)
     assert isinstance(config, SamplingConfig)
@@ -118,7 +118,7 @@ def test_rays_end_where_the_mode_says(training: bool, stop: float) -> None:
 
 
 def test_rays_of_pictures_end_at_the_error_that_is_allowed() -> None:
-    """As many steps of a thick fog as let through more light than that; and as before afterwards."""
+    """Rays have the steps of a thick fog that let through more light than that; and as before afterwards."""
     config = dataclasses.replace(load_method("instant-ngp").config, early_stop=1e-4, train_early_stop=1e-2)
     config, _ = load_method("instant-ngp").decided(config, SCENE)
     assert isinstance(config, SamplingConfig)
@@ -178,7 +178,7 @@ def test_light_is_found_on_the_half_that_is_not_judged(lit: Trainer) -> None:
     plain = shown(lit, lit.train_set)
     assert torch.equal(shown(lit, changed(lit.train_set, width // 2, width)), plain)
     assert not torch.allclose(shown(lit, changed(lit.train_set, 0, width // 2)), plain, atol=1e-3)
-    # What a mask ignores tells nothing, wherever it is.
+    # Ignored pixels have no effect, anywhere in the image.
     for first, last in ((0, 4), (width - 4, width)):
         masked = [
             changed(dataset, first, last, True) for dataset in (lit.train_set, changed(lit.train_set, first, last))
@@ -208,7 +208,7 @@ def test_light_is_looked_for_left_of_the_middle_where_no_mask_is(lit: Trainer, m
 
 @pytest.mark.usefixtures("_soon_fitted")
 def test_the_half_on_which_light_is_found_is_not_judged(lit: Trainer) -> None:
-    """The figure is that of the right half of the very picture shown."""
+    """The figure is measured on the right half of the very picture shown."""
     width = int(lit.train_set.cameras.widths[0])
     found = evaluate(lit.model, lit.train_set, max_images=1)
     assert found.eval_appearance == "half"
@@ -224,7 +224,7 @@ def test_the_half_on_which_light_is_found_is_not_judged(lit: Trainer) -> None:
 
 @pytest.mark.usefixtures("even_clock")
 def test_training_takes_what_its_steps_take(shared_tiny: Path, tmp_path: Path) -> None:
-    """Whatever there is to evaluate: the budget is of seconds."""
+    """The number of evaluations has no effect: the budget is in seconds."""
     trainer = tiny_trainer(
         "instant-ngp", shared_tiny, tmp_path / "run", evaluated=True, max_num_iterations=30,
         steps_per_eval_all_images=5, max_eval_images=1,
@@ -236,7 +236,7 @@ def test_training_takes_what_its_steps_take(shared_tiny: Path, tmp_path: Path) -
 
 
 def test_the_seed_and_the_step_decide_what_is_drawn(shared_tiny: Path, tmp_path: Path) -> None:
-    """From the same parameters on, too: repeats of a comparison differ by their seeds."""
+    """This holds from equal parameters on, too: repeats of a comparison differ by their seeds."""
     drawn: list[Tensor] = []
 
     class Noting(PixelSource):

@@ -58,7 +58,7 @@ class Tab:
         return found["result"].get("value")
 
     def screenshot(self, file: Path | None = None) -> np.ndarray:
-        """What the page looks like, (H, W, 3) uint8."""
+        """Picture of the page, (H, W, 3) uint8."""
         content = base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"])
         if file is not None:
             file.write_bytes(content)
@@ -104,7 +104,7 @@ class Tab:
         self.send("Page.navigate", url=address)
 
     def press(self, text: str) -> None:
-        """Click what shows a text."""
+        """Click the element with a text."""
         script = f"""(() => {{
           const found = [...document.querySelectorAll("button, label, [role=tab], [role=option], p, span, div")]
             .filter(e => e.textContent.trim() === {json.dumps(text)} && e.offsetParent !== null);

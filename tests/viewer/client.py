@@ -56,7 +56,7 @@ class Client:
         self.send({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
 
     def messages(self, seconds: float) -> list[dict[str, Any]]:
-        """What the viewer sends in one parcel."""
+        """Messages that the viewer sends in one parcel."""
         raw = self.socket.recv(timeout=seconds)
         assert isinstance(raw, bytes)
         length = int.from_bytes(raw[8:16], "little")
@@ -92,7 +92,7 @@ class Client:
         raise AssertionError
 
     def finished(self, seconds: float = 0.3) -> np.ndarray:
-        """The last picture, after which nothing is left to draw, and none comes for some time."""
+        """The last picture: nothing is left to draw, and no other comes for some time."""
         found = self.picture()
         for _ in range(200):
             rested = self.rests()

@@ -1,4 +1,4 @@
-"""What tests of the page share: a viewer that is started, its controls as a person uses them, and its picture."""
+"""Shared by tests of the page: a started viewer, its controls as a person uses them, and its picture."""
 
 import json
 import re
@@ -68,7 +68,7 @@ def shown(tab: Tab) -> np.ndarray:
 
 
 def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None, fov: float = 50.0) -> np.ndarray:
-    """What the run's model renders from the page's camera: position, target and up."""
+    """The run's model rendered from the page's camera: position, target and up."""
     width, height = size_of(tab)
     position, target, up = (torch.tensor(camera[i : i + 3], dtype=torch.float64) for i in (0, 3, 6))
     back = torch.nn.functional.normalize(position - target, dim=0)
@@ -100,13 +100,13 @@ def choose(tab: Tab, label: str, option: str) -> None:
 
 
 def to_the_end(tab: Tab) -> None:
-    """Press End on the first slider, which is that of time where there is one."""
+    """Press End on the first slider, which is the time's if there is one."""
     tab.evaluate("document.querySelector('[role=slider]').focus()")
     tab.key("End", "End", 35)
 
 
 def type_into(tab: Tab, label: str, index: int, text: str) -> None:
-    """Replace what one of the fields beside a label holds, as the keyboard does."""
+    """Replace the content of one of the fields beside a label, as the keyboard does."""
     script = f"""(() => {{
       const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
       const first = document.getElementById(found[0].htmlFor).closest(".mantine-NumberInput-root");
@@ -162,7 +162,7 @@ def pixel_of(tab: Tab, camera: list[float], point: Sequence[float]) -> tuple[np.
 
 
 def meets_box(tab: Tab, camera: list[float], low: Sequence[float], high: Sequence[float]) -> np.ndarray:
-    """Which rays of the page's picture meet a box: slabs, in float64, independent of what the viewer does."""
+    """The rays of the page's picture that meet a box: slabs, in float64, independent of the viewer."""
     width, height = size_of(tab)
     position, target, up = (np.array(camera[i : i + 3]) for i in (0, 3, 6))
     ahead = (target - position) / np.linalg.norm(target - position)

@@ -1,4 +1,4 @@
-"""Two runs side by side: one view of two scenes, whose frames differ by a similarity."""
+"""Two runs side by side: one view of two scenes with frames that differ by a similarity."""
 
 import dataclasses
 from pathlib import Path
@@ -30,7 +30,7 @@ WHOLE = Piece(1, 1, 0, 48)
 
 
 def scene(size: float) -> Scene:
-    """A scene whose lengths are `size` times as large."""
+    """A scene with lengths `size` times as large."""
     box = size * torch.tensor([[-3.0] * 3, [3.0] * 3])
     return Scene(box, 0.1 * size, 20.0 * size, 4, True, False, 48, image_pixels=48 * 48)
 
@@ -114,7 +114,7 @@ def test_a_photograph_counts_for_both_runs(here: Loaded, there: Loaded) -> None:
 def test_a_moving_run_beside_a_still_one_shows_its_time(
     here: Loaded, there: Loaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The panel of a still scene has no time; that of the other is then 0."""
+    """The panel of a still scene has no time; the other scene's time is then 0."""
     times = list[float | None]()
 
     def render(view: View, background: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Commands that browsers start: what they print, their progress and their end."""
+"""Commands that browsers start: their output, their progress and their end."""
 
 import os
 import sys
@@ -97,7 +97,7 @@ def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:
 
 
 class Screen:
-    """The controls of a browser, and what it downloads."""
+    """The controls of a browser, and its downloads."""
 
     press: Callable[[Any], None]
 
@@ -153,7 +153,7 @@ def test_a_file_is_sent_once(tmp_path: Path) -> None:
 
 
 def test_an_export_has_a_crop_file_of_its_own(tmp_path: Path) -> None:
-    """What is saved in the run's folder stays as it is. Data that has moved is not asked for."""
+    """The files saved in the run's folder stay as they are. Data that has moved is not asked for."""
     boxes, screen = [Box((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0)), Box((0.0, 0.0, 0.0), (3.0, 3.0, 3.0))], Screen()
     read, files = list[Region](), list[Path]()
 

@@ -28,7 +28,7 @@ def size(stride: int) -> int:
 @pytest.mark.parametrize("fixed", [0.0, 0.01, 0.05])
 @pytest.mark.parametrize("each", [1e-8, 2e-6, 1e-5, 3e-4])
 def test_the_stride_settles_and_stays(fixed: float, each: float) -> None:
-    """A machine whose pictures take a fixed time and one per pixel, give or take a fifth."""
+    """A machine's pictures take a fixed time and one per pixel, give or take a fifth."""
     generator, speed, stride = random.Random(0), Speed(), None
     strides = []
     for _ in range(60):
@@ -40,7 +40,7 @@ def test_the_stride_settles_and_stays(fixed: float, each: float) -> None:
     settled = fixed + each * size(strides[-1])
     assert settled <= 1.5 * BUDGET or strides[-1] == STRIDES[-1]
     finer = [one for one in STRIDES if one < strides[-1]]
-    if finer:  # what is finer would not have been much too fast either
+    if finer:  # a finer stride would not have been much too fast either
         assert fixed + each * size(finer[-1]) > 0.4 * BUDGET
 
 

@@ -84,7 +84,7 @@ def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
 
 
 def test_crop(browser: Chromium, run: Path) -> None:
-    """What is outside of the box is gone from the page, and what is inside is as it was."""
+    """The outside of the box is gone from the page, and the inside is unchanged."""
     with started(command("ns-viewer"), run, "--websocket-port", 17407) as (_, address):
         tab = browser.open(address)
         whole = shown(tab)
@@ -153,7 +153,7 @@ def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def blue_with_time(tmp_path: Path) -> Path:
-    """A K-Planes run of a ball whose blue grows from none to full while the camera circles."""
+    """A K-Planes run of a ball with blue that grows from none to full while the camera circles."""
     data = write_tiny(tmp_path / "ball", counts=(20, 2, 2))
     for split in ("train", "val", "test"):
         file = data / f"transforms_{split}.json"
@@ -178,7 +178,7 @@ def test_time(browser: Chromium, blue_with_time: Path) -> None:
         to_the_end(tab)
         late = shown(tab)
         assert decibels(late, expected(run, tab, look_of(run), 1.0)) > 30
-        assert decibels(late, expected(run, tab, look_of(run), 0.0)) < 28  # what was learnt changes with time
+        assert decibels(late, expected(run, tab, look_of(run), 0.0)) < 28  # the learnt scene changes with time
         tab.close()
 
 

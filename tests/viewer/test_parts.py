@@ -1,4 +1,4 @@
-"""What the viewer shows beside pictures: crops, errors against photographs, cells, curves, newer checkpoints."""
+"""Parts of the viewer beside pictures: crops, errors against photographs, cells, curves, newer checkpoints."""
 
 import dataclasses
 import itertools
@@ -84,7 +84,7 @@ def test_the_edges_and_the_arrows_of_the_box() -> None:
         assert place[axis] == (box.low, box.high)[side][axis]
         assert np.delete(place - [0, 3.5, 3.5], axis).tolist() == [0, 0]
         w, *vector = outward((axis, side))
-        turn = 2 * np.outer(vector, vector) + (2 * w * w - 1) * np.eye(3)  # of quaternions whose w is 0 or 1
+        turn = 2 * np.outer(vector, vector) + (2 * w * w - 1) * np.eye(3)  # of quaternions with w = 0 or 1
         assert (turn @ np.eye(3)[axis]).tolist() == ((2 * side - 1) * np.eye(3)[axis]).tolist()
 
 
@@ -120,7 +120,7 @@ def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
 
 
 class Slow(Speed):
-    """A speed at which strips are a few rows, whatever is measured."""
+    """A speed that makes strips of a few rows, for all measured times."""
 
     def with_one(self, rays: int, seconds: float) -> Speed:
         return self
@@ -155,7 +155,7 @@ def photographs(shared_tiny: Path, tmp_path: Path) -> Photographs:
 
 
 def test_photographs_stand_where_their_refined_cameras_do(shared_tiny: Path, tmp_path: Path) -> None:
-    """Each is moved by what the model has learnt by now."""
+    """Each is moved by the model's present refinement."""
     trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path / "run", sampler="proposal", camera_optimizer="SO3xR3")
     photographs = Photographs(tiny_run("nerfacto", shared_tiny, tmp_path / "run"), lambda: trainer.model)
     before = at(photographs, 3)

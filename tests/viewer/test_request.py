@@ -65,7 +65,7 @@ def test_rows_of_a_smaller_picture_are_rows_of_it(stride: int) -> None:
     some = part.pixel_rays(part.image_pixels(0), 0.1, 9.0)
     torch.testing.assert_close(some.directions, rays.directions.view(height, width, 3)[2:4].reshape(-1, 3))
     corners = rays.directions.view(height, width, 3).double() @ pose.tensor()[:, :3]
-    # The picture spans the same angles whatever the stride: half a pixel less than the field of view at its edges.
+    # The picture spans the same angles for every stride: half a pixel less than the field of view at its edges.
     edge = corners[0, width // 2]
     expected = math.tan(0.4) * (1 - 1 / height)
     assert float(edge[1] / -edge[2]) == pytest.approx(expected, rel=1e-4)

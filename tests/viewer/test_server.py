@@ -38,7 +38,7 @@ FROM_THE_SIDE: dict[str, Any] = {"position": (0.0, -4.0, 0.0), "wxyz": (0.5**0.5
 
 
 class Served:
-    """A viewer of a tiny trained model, whose pictures are drawn in a thread of their own."""
+    """A viewer of a tiny trained model that draws pictures in a thread of its own."""
 
     def __init__(self, folder: Path, data: Path) -> None:
         run = tiny_run("instant-ngp", data, folder, max_num_iterations=60)
@@ -62,7 +62,7 @@ class Served:
                 self.queue.wait(0.01)
 
     def rests(self) -> bool:
-        """Whether every browser has the finished picture of what it asked for last."""
+        """Whether every browser has the finished picture of its last request."""
         browsers, now = list(self.queue._browsers.values()), time.monotonic()
         waiting = [browser.waiting(self.queue.loaded.step, now) for browser in browsers]
         return not any(one.new or one.rough for one in waiting)
@@ -95,7 +95,7 @@ def connected(served: Served) -> Iterator[Callable[..., Client]]:
 
 
 def truth(served: Served, longest: int, **changes: Any) -> np.ndarray:
-    """What the model itself renders from the client's camera."""
+    """The model itself rendered from the client's camera."""
     look = {**LOOK, **changes}
     pose = pose_of(look["wxyz"], look["position"], look["fov"])
     assert pose is not None
@@ -234,7 +234,7 @@ def test_keys(served: Served, connected: Callable[..., Client]) -> None:
 
 @pytest.mark.medium
 def test_a_photograph_lies_over_the_picture(served: Served, connected: Callable[..., Client]) -> None:
-    """From where one was taken; from elsewhere the picture is the model's alone."""
+    """It does so at the pose of a photograph; from elsewhere the picture is the model's alone."""
     client, pose = connected(), served.photographs.pose(3)
     where = {"wxyz": quaternion_of(pose), "position": tuple(pose[:, 3].tolist()), "fov": served.photographs.fov(3)}
     client.look(**where, image_width=60)
@@ -270,7 +270,7 @@ def test_garbage_on_the_socket(served: Served, connected: Callable[..., Client])
     client = connected()
     client.look()
     assert decibels(client.finished(), truth(served, 80)) > 35
-    until(lambda: len(served.page._panels) <= 2)  # those that have left are forgotten
+    until(lambda: len(served.page._panels) <= 2)  # browsers that have left are forgotten
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1:1", "http://localhost.evil.com"])

@@ -41,11 +41,11 @@ WATCH = """(() => {
   const make = URL.createObjectURL;
   URL.createObjectURL = blob => { window.saved.push(blob.size); return make.call(URL, blob); };
 })()"""
-"""Keeps the sizes of what the page saves."""
+"""Keeps the sizes of the files that the page saves."""
 
 
 EDGES = (80, 182, 228)
-"""Colour of the box's edges on the page, whose tone mapping makes it paler."""
+"""Colour of the box's edges on the page; tone mapping makes it paler."""
 
 
 def edge_pixels(tab: Tab) -> int:

@@ -37,7 +37,7 @@ FLAGS = (
 
 
 def opened(browser: str, folder: Path, address: str, *flags: str) -> str:
-    """What Chromium prints that opens an address."""
+    """Output of Chromium that opens an address."""
     command = [browser, *FLAGS, f"--user-data-dir={folder / 'profile'}", *flags, address]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=True).stdout
 
@@ -50,7 +50,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def pictured(browser: str, scene: Path, tmp_path: Path, camera: int, more: str = "") -> torch.Tensor:
-    """What the browser shows of a camera, (H, W, 3)."""
+    """The browser's picture from a camera, (H, W, 3)."""
     shot = tmp_path / "shot.png"
     opened(browser, tmp_path, f"{scene.as_uri()}#camera={camera}&plain=1{more}", f"--screenshot={shot}")
     width, height = SIZE
@@ -189,7 +189,7 @@ def test_the_mouse_turns_and_comes_closer(browser: str, scene: Path, tmp_path: P
     start, eye, moved = (torch.tensor([float(x) for x in text.split()]) for text in (first, dragged, panned))
     focus = torch.tensor(some_facts().focus)
     away = (start - focus).norm()
-    torch.testing.assert_close((eye - focus).norm(), away, atol=1e-3, rtol=0)  # about what is looked at
+    torch.testing.assert_close((eye - focus).norm(), away, atol=1e-3, rtol=0)  # about the point looked at
     assert float((eye - start).norm()) > 0.1
     assert float(distance) < 0.9 * float(away)
     assert float((moved - eye).norm()) > 0.1
@@ -226,7 +226,7 @@ const wait = setInterval(async () => {
 
 @pytest.mark.medium
 def test_a_phone_turns_the_view(browser: str, scene: Path, tmp_path: Path) -> None:
-    """By 30 degrees about the vertical through what is looked at, while it is switched on."""
+    """It turns by 30 degrees about the vertical through the point looked at, while it is switched on."""
     file = tmp_path / "motion.html"
     file.write_text(scene.read_text(encoding="utf-8").replace("</body>", MOTION + "</body>"), encoding="utf-8")
     dom = opened(browser, tmp_path, f"{file.as_uri()}#sort=here", "--dump-dom")
@@ -289,7 +289,7 @@ const wait = setInterval(() => {
 
 @pytest.mark.medium
 def test_the_page_measures_as_we_do(browser: str, tmp_path: Path) -> None:
-    """Two points, one before another Gaussian; the length and its error are those of Python."""
+    """Two points, one before another Gaussian; the length and its error equal Python's."""
     ends = torch.tensor([[0.3, -0.2, 0.1], [-0.2, 0.1, 0.35]])
     places = [[2.5 * math.cos(a), 2.5 * math.sin(a), 0.8] for a in (0.3 * k for k in range(12))]
     poses = torch.stack(

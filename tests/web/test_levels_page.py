@@ -48,7 +48,7 @@ def facts_in(page: Path) -> dict[str, Any]:
 
 
 def test_chunks_lie_beside_the_page(file: LevelsFile, tmp_path: Path) -> None:
-    """In the frame of the page, which is that of the scene here; chunks of an earlier page are removed."""
+    """They are in the frame of the page, here the scene's; chunks of an earlier page are removed."""
     out = tmp_path / "out"
     (out / "scene").mkdir(parents=True)
     (out / "scene" / "99999.spz").write_bytes(b"old")
@@ -124,7 +124,7 @@ def page(file: LevelsFile, tmp_path: Path) -> tuple[Path, DrawnLevels]:
 def test_the_browser_loads_and_draws_the_levels_that_we_draw(
     browser: str, page: tuple[Path, DrawnLevels], tmp_path: Path
 ) -> None:
-    """The colours that SPZ rounds are not those of the coarsest level."""
+    """The colours that SPZ rounds are not the coarsest level's."""
     path, model = page
     own = model.render_rgb(View(some_cameras()[1:2]), torch.ones(3)).clamp(0, 1)
     assert float(own.std()) > 0.05  # there is something to see

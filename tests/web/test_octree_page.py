@@ -69,7 +69,7 @@ def test_the_data_are_the_octree(degree: int) -> None:
     for name in ("table", "scales", "offsets", "codes", "colors"):
         np.testing.assert_array_equal(found[name], getattr(leaves, name).numpy())
     assert found["cell"] == np.float32(layout.cell)
-    # What ends a ray costs at most a step of eight bits.
+    # The end of a ray costs at most a step of eight bits.
     assert found["limit"] * error_bound(leaves.coefficients(), 1.0) == pytest.approx(1 / 255)
 
 
@@ -134,7 +134,7 @@ def test_a_page_of_an_octree_is_alone() -> None:
 
 
 def test_the_degree_and_the_leaves_that_fit() -> None:
-    """A leaf of degree d has 1 + 3 (d + 1)^2 bytes, of which 0.85 are left after compression."""
+    """A leaf of degree d has 1 + 3 (d + 1)^2 bytes, and 0.85 of them after compression."""
     largest = torch.cat([torch.linspace(0.1, 1, 1000), torch.zeros(500)])
 
     def found(size: float) -> tuple[int, int]:

@@ -45,7 +45,7 @@ ROOT = Path(__file__).parents[2]
 
 
 class Elements(HTMLParser):
-    """Scripts, their text, the text of the title of a page, and what its meta elements say."""
+    """Scripts, their text, the text of the title of a page, and its meta elements."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class Elements(HTMLParser):
 
 def test_gaussians_survive_the_page() -> None:
     given = some_gaussians(500)
-    given.colors.clamp_(-3, 3)  # what SPZ holds
+    given.colors.clamp_(-3, 3)  # the range of SPZ
     given.harmonics.clamp_(-1, 1)
     text, costs = make_page(given, some_facts(), 30)
     assert costs == []
@@ -106,7 +106,7 @@ def test_impossible_sizes_are_refused(megabytes: float) -> None:
 
 
 def test_a_page_says_how_its_gaussians_are_drawn(tmp_path: Path) -> None:
-    """To its program, and in its SPZ file to whoever takes it out."""
+    """It says so to its program, and in its SPZ file for other programs."""
     look = Look(True, 0.1, "depth")
     text = make_page(some_gaussians(20), some_facts(look=look), 30)[0]
     found = json.loads(Elements(text).scripts[0])["look"]
@@ -127,7 +127,7 @@ def test_no_name_leaves_its_place() -> None:
 
 
 def test_link_previews_are_told_title_and_picture() -> None:
-    """By the names of https://ogp.me, and an address that a program elsewhere can follow."""
+    """It uses the names of https://ogp.me, and an address that a program elsewhere can follow."""
     plain = Elements(page(b"", some_facts('A "cup" & <saucer>'))).meta
     assert (plain["og:title"], plain["og:type"]) == ('A "cup" & <saucer>', "website")
     assert plain["og:description"] == "About."

@@ -1,4 +1,4 @@
-"""The web page's program in Node.js, as far as it needs no WebGL: what it unpacks, and the order of drawing."""
+"""The web page's program in Node.js, as far as it needs no WebGL: unpacking, and the order of drawing."""
 
 import base64
 import json
@@ -32,7 +32,7 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 
 def run(code: str, given: Any) -> Any:
-    """Run JavaScript behind the page's functions; it answers by `answer(value)`, and `given` is what it is given."""
+    """Run JavaScript behind the page's functions; it answers by `answer(value)`, and `given` is its input."""
     if (node := shutil.which("node")) is None:
         pytest.skip("there is no Node.js; the page's program is not run")
     program = "".join((PAGE / name).read_text(encoding="utf-8") for name in PARTS)
@@ -44,7 +44,7 @@ def run(code: str, given: Any) -> Any:
 
 @pytest.mark.parametrize("plain", [True, False])
 def test_a_file_with_a_comment_is_unpacked(plain: bool) -> None:
-    """By our own inflate, and by the browser's: the centres are those that were written."""
+    """Our own inflate and the browser's both give the written centres."""
     given = some_gaussians(50)
     content = base64.b64encode(encoded(given, look=Look(True, 0.1, "depth"))).decode()
     code = "gunzip(bytesOf(given.content), given.plain).then((raw) => answer([...gaussiansOf(raw).centers]));"
@@ -53,7 +53,7 @@ def test_a_file_with_a_comment_is_unpacked(plain: bool) -> None:
 
 
 def test_the_order_is_by_distance_or_by_depth() -> None:
-    """Of two chunks, in the places that they have in the table; a third is not shown."""
+    """Two chunks are in their places in the table; a third is not shown."""
     means = some_gaussians(300).means.double()
     eye, axis = torch.tensor([2.0, -1.0, 0.5]).double(), torch.tensor([-0.8, 0.0, -0.6]).double()
     code = (
@@ -84,7 +84,7 @@ def facts_of(nodes: Nodes) -> dict[str, Any]:
 
 @pytest.mark.parametrize(("distance", "turn"), [(6.0, 0.0), (2.0, 0.4), (0.4, 0.8), (3.0, 3.1)])
 def test_the_cut_of_levels_is_ours(nodes: Nodes, distance: float, turn: float) -> None:
-    """With enough memory and with too little; and no node that an image may show is left out."""
+    """The memory is enough or too little; no node that an image may show is left out."""
     seen_by = camera(distance, turn=turn)
     ours = splat_camera(seen_by, 0.01)
     seen, sizes = in_view(nodes.boxes, ours, tangents(seen_by, 0.3)), sizes_on_image(nodes, ours, 0.01)
@@ -134,7 +134,7 @@ def test_what_is_missing_is_shown_by_what_is_above_it(nodes: Nodes) -> None:
 
 @pytest.mark.parametrize("angles", [(0.0, 90.0, 0.0), (30.0, 90.0, 0.0), (200.0, 50.0, -30.0), (10.0, -20.0, 80.0)])
 def test_a_phone_aims_where_its_back_points(angles: tuple[float, float, float]) -> None:
-    """By the rotations about z, x and y, in the order of the specification."""
+    """The rotations are about z, x and y, in the order of the specification."""
     a, b, c = (math.radians(angle) for angle in angles)
     about_z = torch.tensor([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
     about_x = torch.tensor([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])

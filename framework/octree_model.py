@@ -23,7 +23,7 @@ from nerfloom.model import Loss, Model
 from nerfloom.octrees.drawn import RAYS_AT_ONCE, DrawsOctree
 
 STOP = 1e-2
-"""Transmittance below which rays end in training."""
+"""Rays end below this transmittance in training."""
 
 
 @dataclass(frozen=True)

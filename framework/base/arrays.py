@@ -42,8 +42,8 @@ def read_array(path: Path) -> np.ndarray:
 def read_small_arrays(path: Path, wanted: Callable[[str], bool], largest: int) -> dict[str, np.ndarray]:
     """Read arrays of numbers from a .npz file.
 
-    Nothing is unpickled, no other entry is read, and what an entry's header claims is compared with what it holds
-    before memory is allocated.
+    Nothing is unpickled, no other entry is read, and an entry's header is compared with its size before memory is
+    allocated.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""Errors that a user can act on: one line that says what is wrong, where, and what to do."""
+"""Errors that a user can act on: one line with the fault, the place and the remedy."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class RegionFlags:
-    """The part of space that is kept, in the frame and unit of exports. Of several, what is in all of them is kept."""
+    """The part of space that is kept, in the frame and unit of exports. The intersection of several is kept."""
 
     crop_box: str | None = None
     """Keep the inside of a box: X,Y,Z,X,Y,Z, its minimum and its maximum corner. Default: everything."""

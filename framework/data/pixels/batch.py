@@ -44,7 +44,7 @@ class PixelBatch:
     """(R,) standard deviation of `distances`, if these come from a reconstruction's points; None if depth images
     measured them."""
     clear: Tensor | None = None
-    """(R,) distance from the camera that the pixel's image shows to be empty; None if unknown."""
+    """(R,) length of the empty space in front of the camera, shown by the pixel's image; None if unknown."""
     weights: Tensor | None = None
     """(R,) factors of the pixels' losses, with mean 1, if pixels differ in size; 0 for pixels that do not count."""
 
@@ -126,7 +126,7 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
 
 
 def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
-    """Draw `count` pixels of `dataset`, as many from each of `num_images` random images, by torch's generator."""
+    """Draw `count` pixels of `dataset`, equally many from each of `num_images` random images, by torch's generator."""
     drawn, ends = dataset.drawn, dataset.cameras.offsets.to(dataset.pixels.device)
     ranks = ends if drawn is None else drawn.ranks(ends)
     sizes = ranks.diff()
@@ -149,8 +149,8 @@ def draw_batch(
 ) -> PixelBatch:
     """Draw a batch of pixels.
 
-    Pixels with a sparse depth are few, so some are drawn in addition: each shows where its surface is, and that the
-    space before it is empty. Their colours count like all others.
+    Pixels with a sparse depth are few, so some are drawn in addition: each gives the distance of its surface, and empty
+    space before it. Their colours count like all others.
 
     Args:
         dataset: the training images.

@@ -16,9 +16,9 @@ from nerfloom.export.cameras import SPLITS, PosedFiles, coefficients, rational
 OPENCV = {"k1": "k1", "k2": "k2", "p1": "p1", "p2": "p2", "k3": "k3", "k4": "k7"}
 """Coefficient of the file -> coefficient of `LENSES["opencv"]`; the file's k4 is the r^8 term."""
 RATIONAL = {name: name for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")}
-"""The same for COLMAP's FULL_OPENCV, with k4 to k6 in the denominator."""
+"""Coefficients of COLMAP's FULL_OPENCV, in the same way, with k4 to k6 in the denominator."""
 FISHEYE = {name: name for name in ("k1", "k2", "k3", "k4")}
-"""The same for a fisheye lens."""
+"""Coefficients of a fisheye lens, in the same way."""
 POINTS = "sparse_pc.ply"
 """Name of the file of sparse points beside the JSON file."""
 
@@ -40,7 +40,7 @@ def write_transforms(file: Path, posed: PosedFiles, relative: bool) -> None:
 def transforms(posed: PosedFiles, folder: Path, relative: bool) -> dict[str, Any]:
     """Return the content of transforms.json.
 
-    Numbers that all images share are the file's, and others are the frames'.
+    Numbers that all images share are stored once in the file, all others in each frame.
 
     Args:
         posed: the images.

@@ -69,7 +69,7 @@ class Distortion:
     coefficients: Tensor
     """(M, 9) coefficients in the order of `LENSES["opencv"]`, for both models."""
     reach: Tensor
-    """(M,) radius of the disk on which the distortion is one to one."""
+    """(M,) radius of the disk where the distortion is one to one."""
     bounds: Tensor
     """(M, 2) radii of distorted positions: all within the first have a ray, and none beyond the second has."""
     iterations: int | None = None
@@ -139,7 +139,7 @@ def distort(x: Tensor, y: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor,
 
 
 def find_reach(coefficients: Tensor, maximum: float) -> Tensor:
-    """Return the radius (M,) of the largest disk around 0 on which the Jacobian of `distort` is positive definite.
+    """Return the radius (M,) of the largest disk around 0 where the Jacobian of `distort` is positive definite.
 
     With f the distorted radius, the eigenvalues are at least f'(r) and f(r) / r, less 6 |(p1, p2)| r.
 

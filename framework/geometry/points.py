@@ -12,7 +12,7 @@ from nerfloom.geometry.rays import Rays, Samples
 
 Footprint = Literal["none", "radius", "gaussian", "frustum"]
 """Size of points that a field needs: none; the radius of the pixel's cone; mean and covariance of the cone's interval;
-or that interval itself."""
+or the interval itself."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Points:
         if self.axes is None or self.variances is None:
             raise ValueError("these points have no Gaussians: sample_points() computes them for footprint 'gaussian'")
         deviations = self.variances.clamp(min=torch.finfo(self.variances.dtype).tiny).sqrt()  # has a gradient at 0
-        # Indexing by a list would bring it from the CPU.
+        # Indexing by a list would copy the list from the CPU.
         return frames(self.axes) * torch.cat([deviations, deviations[:, 1:]], dim=-1)[:, None]
 
     def sized(self, deviation: float) -> Points:

@@ -59,7 +59,7 @@ class Job:
     resources: Resources = Resources()
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the job as plain data, from which another process can run it."""
+        """Return the job as plain data, so that another process can run it."""
         steps = [
             {
                 "command": list(step.command),

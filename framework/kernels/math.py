@@ -91,7 +91,7 @@ def safe_normalize(v: Tensor, eps: float = 1e-12) -> Tensor:
 
     Args:
         v: (..., D) vectors.
-        eps: length below which the result and its gradient are 0.
+        eps: minimum length; shorter vectors have a result and a gradient of 0.
     """
     least = max(eps, torch.finfo(v.dtype).tiny)  # 1e-12 would be 0 in float16
     scaled = v / v.detach().abs().amax(-1, keepdim=True).clamp(min=least)  # shorter than 1 if |v| < least

@@ -1,9 +1,9 @@
 """The places of the leaves of a sparse voxel octree.
 
-All leaves are cubes of one size, the cells of a grid over a box. Of the octree's levels, three are kept: bricks of 8^3
+All leaves are cubes of one size, the cells of a grid over a box. Three of the octree's levels are stored: bricks of 8^3
 cells, their octants of 4^3, and cells. A dense grid of bricks says where they are and, in empty space, how far away the
-nearest one is, so that a ray passes it in few steps. An octant is a bit set of its cells, as in Laine and Karras 2010,
-"Efficient sparse voxel octrees", and the leaves of an octant follow each other.
+nearest one is, so that a ray crosses empty space in few steps. An octant is a bit set of its cells, as in Laine and
+Karras 2010, "Efficient sparse voxel octrees", and the leaves of an octant follow each other.
 
 A grid may have coarser ones around it, each with cells of twice the edge. They show the space outside of its box, and
 serve rays where their pixel is much wider than a cell (`walk.py`).
@@ -30,7 +30,7 @@ MAX_DISTANCE = 16
 MAX_BRICKS = 2**24
 """Maximum number of bricks in the box, empty ones included."""
 MAX_LEVELS = 24
-"""Maximum number of grids around one another, as in `walk.h`."""
+"""Maximum number of nested grids, as in `walk.h`."""
 BRICKS_AT_ONCE = 2**12
 """Number of bricks that list their cells together; each takes some kilobytes meanwhile."""
 

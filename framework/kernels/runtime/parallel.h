@@ -1,9 +1,9 @@
 // Distribution of work over threads: each chunk is taken by whichever thread is free.
 //
-// A region's result never depends on which thread takes which chunk, so it has the same bits for any number of threads,
-// for late threads, and for the caller's thread alone. The caller takes chunks like the others, and waits only for
-// chunks that others have started. So a thread that does not run, because another program has its core, delays a region
-// by one chunk at most, not by its share of the whole. Waiting threads poll briefly and then sleep.
+// A region's result never depends on the distribution of chunks to threads, so it has the same bits for any number of
+// threads, for late threads, and for the caller's thread alone. The caller takes chunks like the others, and waits only
+// for chunks that others have started. So a thread that does not run, because another program has its core, delays a
+// region by one chunk at most, not by its share of the whole. Waiting threads poll briefly and then sleep.
 #pragma once
 
 #include <algorithm>

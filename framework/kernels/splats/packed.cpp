@@ -3,7 +3,7 @@
 
 namespace {
 
-constexpr int PACK = 16;  // Gaussians in a block, whatever the vectors' length
+constexpr int PACK = 16;  // Gaussians in a block, for vectors of any length
 static_assert(PACK % LANES == 0, "a vector lies within a block");
 constexpr int64_t GRAIN = 64;  // blocks in a chunk
 

@@ -92,7 +92,7 @@ EXPORT int splat_sort(const float* records, int64_t count, const float* keys, in
     });
 }
 
-// The most entries that the tiles' lists can have: one for each tile that the box around a Gaussian touches.
+// Maximum number of entries of the tiles' lists: one for each tile that the box around a Gaussian touches.
 EXPORT int splat_bound(const float* records, int64_t count, int width, int height, int threads, int64_t* bound) {
     return guarded([&] {
         const Grid grid(width, height);
@@ -110,9 +110,9 @@ EXPORT int splat_bound(const float* records, int64_t count, int width, int heigh
     });
 }
 
-// The lists: tile t's entries are [offsets[t], offsets[t + 1]), from front to back. Each says which Gaussian, and its
-// slot: the place of the entry where they are sorted by Gaussian; Gaussian g's are from firsts[g]. There is room for
-// `bound` entries. Without `slots` they are left out. Returns how many entries there are.
+// The lists: tile t's entries are [offsets[t], offsets[t + 1]), from front to back. Each has its Gaussian's index, and
+// its slot: the place of the entry if all are sorted by Gaussian; Gaussian g's are from firsts[g]. There is room for
+// `bound` entries. Without `slots` they are left out. Returns the number of entries.
 EXPORT int splat_bin(const float* records, int64_t count, const int32_t* order, int64_t visible, int width, int height,
                      int64_t bound, int32_t* firsts, int32_t* offsets, int32_t* ids, int32_t* slots, int threads,
                      int64_t* entries) {
@@ -127,7 +127,7 @@ EXPORT int splat_bin(const float* records, int64_t count, const int32_t* order, 
             own.reserve(size_t(4 * GRAIN));
             for (int64_t g = chunk * GRAIN; g < std::min(count, (chunk + 1) * GRAIN); g++) {
                 if (records[g * RECORD + CUT] > 0) for_tiles(records + g * RECORD, grid, [&](int tile) { own.push_back(tile); });
-                firsts[g + 1] = int32_t(own.size());  // of those in the chunk
+                firsts[g + 1] = int32_t(own.size());  // entries of the chunk's Gaussians
             }
         });
         std::vector<int64_t> before(found.size() + 1, 0);
@@ -141,8 +141,8 @@ EXPORT int splat_bin(const float* records, int64_t count, const int32_t* order, 
             for (int64_t g = chunk * GRAIN; g < std::min(count, (chunk + 1) * GRAIN); g++)
                 firsts[g + 1] += int32_t(before[size_t(chunk)]);
         });
-        // Dealt in the order of distance: how many of each tile a part of them has, where they go, and there. Few parts,
-        // as each has a number for every tile.
+        // Entries are dealt out in the order of distance: each part counts its entries of each tile, finds their
+        // places, and writes them. There are few parts, because each has a count for every tile.
         const int64_t parts = std::min<int64_t>((visible + GRAIN - 1) / GRAIN, 4 * threads);
         const auto part_of = [&](int64_t part, const auto& body) {
             for (int64_t i = visible * part / parts; i < visible * (part + 1) / parts; i++) body(order[i]);

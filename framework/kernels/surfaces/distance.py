@@ -51,7 +51,7 @@ def _with_gradient(
     second: Tensor,
     layout: HashGridLayout,
 ) -> Tensor:
-    """Compute `distance_network` by autograd through a form of the grid that has the derivatives that are needed."""
+    """Compute `distance_network` by autograd through a form of the grid with the needed derivatives."""
     learns = torch.is_grad_enabled()
     with torch.enable_grad():
         positions = positions if positions.requires_grad else positions.detach().requires_grad_()
@@ -149,7 +149,7 @@ def _few_operations(
     layout: HashGridLayout,
     deferred: TableGradient | None,
 ) -> Tensor:
-    with derivatives(2):  # a loss on the gradient of the distance has those of the grid of order 2
+    with derivatives(2):  # a loss on the gradient of the distance needs the grid's second derivatives
         return _with_gradient(hash_grid, positions, table, first, second, layout)
 
 

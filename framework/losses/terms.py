@@ -135,7 +135,7 @@ class DepthError(LossTerm):
 
 
 class FreeSpace(LossTerm):
-    """Matter in space through which other images see points (`--free-space`)."""
+    """Matter in space that other images see through (`--free-space`)."""
 
     def __init__(self) -> None:
         super().__init__("free_space", "free_space_loss_mult")

@@ -122,4 +122,4 @@ def _coefficients(calibration: Element, where: str) -> dict[str, float]:
     try:
         return {name: bounded(calibration.findtext(name) or 0) for name in COEFFICIENTS}
     except UNUSABLE as error:
-        raise DataError(f"{where} has a calibration in which a number is not finite") from error
+        raise DataError(f"{where} has a calibration with a number that is not finite") from error

@@ -159,7 +159,7 @@ def over_background(inside: Rendered, outside: Rendered, distances: Callable[[Te
 
 
 def _median(outside: Rendered, left: Tensor) -> Tensor:
-    """Return the position (R,) of the first outside sample behind which the ray's transmittance is at most 0.5.
+    """Return the position (R,) of the first outside sample with a transmittance of at most 0.5 behind it.
 
     Args:
         outside: the outside, with the same number of samples on each ray.

@@ -43,7 +43,7 @@ MAX_LEVELS = 16
 ENDLESS_FAR = 1e10
 """Far end of the last sample of an endless ray, scene units."""
 WARM_UP_STEPS = 256
-"""Number of training steps during which cells are updated in a fixed shuffled order."""
+"""Number of first training steps that update cells in a fixed shuffled order."""
 WARM_UP_DECAY, DECAY = 0.7, 0.8
 """Factors of a cell's density at each update, during warm-up and afterwards."""
 TIMES_PER_VISIT, CELLS_A_TIME, MOVING_DECAY = 4, 6, 0.95
@@ -56,8 +56,8 @@ are more cells, and a smaller fraction is occupied."""
 PASSES, PASSES_OF_SLICES = 4, 1
 """Number of passes over all cells during warm-up, without and with time slices."""
 COARSE_STEPS = (WARM_UP_STEPS // 4, 4.0), (WARM_UP_STEPS, 2.0)
-"""Step until which the march through nested boxes takes longer steps, and their relative length. Without known empty
-cells, few rays would use up all samples."""
+"""Pairs of a number of training steps, and the relative length of steps of the march through nested boxes until then.
+Without known empty cells, few rays would use up all samples."""
 SHUFFLE_STRIDE = 2654435761
 """A prime number. Its multiples modulo the number of cells visit every cell once per pass, in scattered order."""
 

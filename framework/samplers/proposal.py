@@ -39,7 +39,7 @@ ANNEALING_SLOPE = 10.0
 PADDING = 0.01
 """Sum of the padding added to the weights of a ray, so that every interval can be drawn."""
 ALWAYS_LEARN_UNTIL, LEARN_EVERY = 256, 4
-"""Step until which the proposals learn in every step, and the number of steps between updates afterwards."""
+"""Number of first steps that all train the proposals, and the number of steps between updates afterwards."""
 ENDLESS_FAR = 1e10
 """Far end of the last interval of an endless ray, scene units."""
 

@@ -180,7 +180,7 @@ def _means(file: Path, level: int, section: _Section, buckets: bytes, stored: np
         raise DataError(f"{file} is damaged: the buckets of a section hold too few Gaussians; export it again")
     centers = np.frombuffer(buckets[4 * section.partial :], "<f4").reshape(-1, 3)
     steps = section.steps or STEPS
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is removed later
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are removed later
         return (stored.astype(np.float64) - steps) * (section.block / 2 / steps) + centers[bucket].astype(np.float64)
 
 
@@ -204,7 +204,7 @@ def _harmonics(header: _Header, stored: np.ndarray) -> Tensor:
     values = stored.astype(np.float64)
     if header.level == 2:
         low, high = header.low or -HALF_RANGE, header.high or HALF_RANGE
-        with np.errstate(invalid="ignore"):  # what is not finite is removed later
+        with np.errstate(invalid="ignore"):  # values that are not finite are removed later
             values = low + values / 255 * (high - low)
     bands = [values[:, :9], values[:, 9:]]
     return torch.cat([_float(band).reshape(len(values), 3, band.shape[1] // 3) for band in bands], -1)

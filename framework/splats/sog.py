@@ -83,7 +83,7 @@ def read_sog(file: Path) -> Splats:
     images = dict(zip(_keys(meta), contents, strict=True))
     lower, upper = (_pixels(file, content, count)[:, :3] for content in images["means"])
     low, high = (_numbers(file, meta["means"], key, 3) for key in ("mins", "maxs"))
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is removed later
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are removed later
         logs = low + (high - low) * ((lower.astype(np.float64) + 256 * upper.astype(np.float64)) / 65535)
         means = np.sign(logs) * np.expm1(np.abs(logs))
     shade = _pixels(file, images["sh0"][0], count)
@@ -195,7 +195,7 @@ def _codes(file: Path, meta: dict[str, Any], key: str) -> np.ndarray:
     if not isinstance(values, list) or values[:1] != [None]:
         return _numbers(file, meta[key], "codebook", CODES)
     others = _numbers(file, {"codebook": values[1:]}, "codebook", CODES - 1)
-    with np.errstate(over="ignore"):  # what is not finite is removed later
+    with np.errstate(over="ignore"):  # values that are not finite are removed later
         return np.concatenate([others[:1] + (others[0] - others[-1]) / (CODES - 1), others])
 
 

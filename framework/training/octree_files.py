@@ -25,7 +25,7 @@ SHIFT = 1e-3
 
 
 def load_octree(file: Path, data: Path | None, data_format: DataFormat | None, device_type: Any) -> Loaded:
-    """Load an octree, in the scene of its data, or without data in the scene that it knows.
+    """Load an octree, in the scene of its data, or without data in its stored scene.
 
     Args:
         file: the file.

@@ -85,7 +85,7 @@ def render_path(loaded: Loaded, name: str, output: Path, settings: PathSettings)
 
 
 def _views(name: str, settings: PathSettings, loaded: Loaded, output: Path) -> Views:
-    """Return the run or file, at its final image size."""
+    """Return the views to render, at their final size."""
     views = VIEWS[name](settings, loaded)
     sizes = torch.stack([views.cameras.widths, views.cameras.heights])
     if int(sizes.min()) < 1:

@@ -96,7 +96,7 @@ class Status:
 
 
 def in_training(run: Run, trainer: Trainer) -> Loaded:
-    """Return the run of `trainer`, at its present step, as something to look at."""
+    """Return the run of `trainer`, at its present step, for viewing."""
     placement, checkpoints = trainer.train_set.placement, run.folder / FOLDER
     loaded = Loaded(trainer.model, placement, run.method, run.folder, checkpoints, trainer.state.step, run)
     return loaded.scaled(read_scale(run.folder))

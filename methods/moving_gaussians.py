@@ -123,7 +123,7 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
             time: in [0, 1]; None for all of them, at rest.
         """
         found = super().gaussians(time)
-        # NaN is no reason to leave one out here: whoever asks for Gaussians counts and reports those.
+        # Gaussians with NaN stay here: callers count and report them.
         return found if time is None else found[~(torch.sigmoid(found.logits) <= MIN_ALPHA)]
 
     def penalised_opacities(self, gaussians: Gaussians, time: float | None) -> Tensor:
@@ -179,9 +179,9 @@ def log_visibility(gaussians: Gaussians, time: float) -> Tensor:
 
 
 def shown_at(gaussians: Gaussians, time: float) -> Gaussians:
-    """Return where Gaussians are at a time, and how opaque. Differentiable.
+    """Return Gaussians with their positions and opacities at a time. Differentiable.
 
-    A centre is at mean + velocity (t - moment). The opacity is that at rest times `log_visibility`'s exponential.
+    A centre is at mean + velocity (t - moment). The opacity at rest is multiplied by `log_visibility`'s exponential.
 
     Args:
         gaussians: N Gaussians at rest, with `velocities` in scene units per unit of time, `moments` and

@@ -15,7 +15,7 @@ from tests.release.sources import ROOT, version
 
 PACKAGES = ("framework", "methods", "dataparsers")
 MAX_WHEEL = 6_000_000
-"""Bytes. The kernels of five instruction sets are most of it."""
+"""Maximum size of the wheel, bytes. The kernels of five instruction sets take most of it."""
 MAX_SDIST = 3_000_000
 """Bytes."""
 DATA = (".png", ".jpg", ".jpeg", ".gif", ".exr", ".mp4", ".npy", ".npz", ".ply", ".spz", ".ckpt", ".pt", ".zip")

@@ -152,7 +152,7 @@ def test_growth_asks_for_as_much_of_images_of_half_the_size() -> None:
 
 @pytest.mark.slow
 def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None:
-    """After no step of its own, better than anywhere in the box; the same bits each time."""
+    """Without a step of its own it is better than anywhere in the box, with the same bits each time."""
     from nerfloom.evaluation.evaluator import evaluate
 
     psnr, bits = {}, []
@@ -219,7 +219,7 @@ def test_a_checkpoint_has_as_many_gaussians_as_it_has(shared_tiny: Path, tmp_pat
 
 
 def test_images_of_nothing_leave_nothing(tiny: Path, tmp_path: Path) -> None:
-    """All Gaussians go, and none comes: training, pictures and a resumed run do without any."""
+    """All Gaussians are removed, and none is added: training, pictures and a resumed run do without any."""
     for file in (tiny / "train").iterdir():
         iio.imwrite(file, np.zeros((20, 20, 4), np.uint8))
     settings: dict[str, Any] = {"start": "random", "rate_factor": 50.0}

@@ -1,4 +1,4 @@
-"""The list of conditions: complete, selectable, and each a scene and settings that hang together."""
+"""The list of conditions: complete, selectable, and each a scene with matching settings."""
 
 import math
 from dataclasses import replace

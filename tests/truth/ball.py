@@ -108,10 +108,10 @@ def met(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.nda
     """
     towards = CENTRE - origins
     along = (towards * directions).sum(-1)
-    surely = 1 - ((towards**2).sum(-1) - along**2) / RADIUS**2
-    distances = along - RADIUS * np.sqrt(np.clip(surely, 0, None))
+    margins = 1 - ((towards**2).sum(-1) - along**2) / RADIUS**2
+    distances = along - RADIUS * np.sqrt(np.clip(margins, 0, None))
     points = origins + distances[:, None] * directions
-    return 0.5 + 0.45 * np.sin((points - CENTRE) @ WAVES.T), distances, surely
+    return 0.5 + 0.45 * np.sin((points - CENTRE) @ WAVES.T), distances, margins
 
 
 def looks(pose: np.ndarray, lens: Lens) -> np.ndarray:
@@ -126,9 +126,9 @@ def photograph(index: int, lens: Lens = PINHOLE) -> np.ndarray:
     """(HEIGHT, WIDTH, 4) uint8: the ball, and nothing around it. Transparent pixels have a misleading colour."""
     pose = pose_of(index)
     directions = looks(pose, lens)
-    colors, _, surely = met(np.broadcast_to(pose[:3, 3], directions.shape), directions)
-    rgba = np.concatenate([colors, surely[:, None] > 0], -1)
-    rgba[surely <= 0, :3] = (1.0, 0.0, 0.5)
+    colors, _, margins = met(np.broadcast_to(pose[:3, 3], directions.shape), directions)
+    rgba = np.concatenate([colors, margins[:, None] > 0], -1)
+    rgba[margins <= 0, :3] = (1.0, 0.0, 0.5)
     return (rgba * 255).round().astype(np.uint8).reshape(HEIGHT, WIDTH, 4)
 
 
@@ -136,8 +136,8 @@ def depth(index: int, lens: Lens = PINHOLE) -> np.ndarray:
     """(HEIGHT, WIDTH) metres along the camera's axis to the ball; 0 beside it."""
     pose = pose_of(index)
     directions = looks(pose, lens)
-    _, distances, surely = met(np.broadcast_to(pose[:3, 3], directions.shape), directions)
-    return np.where(surely > 0, distances * -(directions @ pose[:3, 2]), 0).reshape(HEIGHT, WIDTH)
+    _, distances, margins = met(np.broadcast_to(pose[:3, 3], directions.shape), directions)
+    return np.where(margins > 0, distances * -(directions @ pose[:3, 2]), 0).reshape(HEIGHT, WIDTH)
 
 
 def write_photographs(folder: Path, names: list[str], lens: Lens = PINHOLE) -> None:

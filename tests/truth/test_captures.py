@@ -44,12 +44,12 @@ def assert_pixels_show_the_ball(scene: ParsedScene, steps: float | None) -> Data
         stored = data.image(index).view(len(pixels), -1).numpy() / 255
         for make in (data.cameras.pixel_rays, data.cameras.pixel_rays_reference):
             origins, directions = in_own_frame(scene, make(pixels, 0.0, 10.0))
-            colors, distances, surely = met(origins, directions)
-            inside = surely > SURE
+            colors, distances, margins = met(origins, directions)
+            inside = margins > SURE
             assert inside.sum() > 100
             assert np.abs(stored[inside, :3] - colors[inside]).max() < 1.5 / 255
             assert (stored[inside, 3] == 1).all()
-            assert (stored[surely < -SURE, 3] == 0).all()
+            assert (stored[margins < -SURE, 3] == 0).all()
         if steps is not None:
             assert data.depths is not None
             turn = np.eye(3) if scene.transform is None else scene.transform[:, :3].double().numpy()

@@ -54,7 +54,7 @@ class Times:
 
 
 def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
-    """Measure the pictures of a trained run for one browser with a camera that turns, then rests until the picture is
+    """Measure the pictures of a trained run in one browser: its camera turns, then rests until the last one is
     finished.
 
     Args:

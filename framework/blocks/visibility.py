@@ -1,5 +1,4 @@
-"""Visibility networks: they learn which points the training images of a block see, so that pictures leave out other
-blocks.
+"""Visibility networks: they learn which points a block's training images see, so that pictures omit other blocks.
 
 Source: Block-NeRF (Tancik et al. 2022), section 4.2, "Visibility Prediction". A small network learns the transmittance
 of a point seen from a direction. It is 1 in front of surfaces, 0 behind them, and 0 where no training image has looked.

@@ -83,8 +83,7 @@ def miss(cameras: Cameras, camera: int, column: float, row: float, point: torch.
 
 
 def worst_miss(scene: ParsedScene, true_poses: np.ndarray, points: np.ndarray = POINTS) -> float:
-    """Largest distance of a point from the ray of the pixel that shows it in the input, over all cameras and points,
-    with images of any size.
+    """Largest distance of a point from the ray of its pixel in the input, for cameras with images of any size.
 
     Args:
         true_poses: (M, 4, 4) of the scene's images, in the input's frame.

@@ -54,8 +54,7 @@ class Times:
 
 
 def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
-    """Measure the pictures of a trained run in one browser: its camera turns, then rests until the last one is
-    finished.
+    """Measure the pictures of a trained run in one browser: the camera turns, then rests until the last is done.
 
     Args:
         run: the run's folder.

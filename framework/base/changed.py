@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 def changed(settings: T, given: Mapping[str, Any], what: str) -> T:
-    """Return the dataclass `settings` of `what` with the values that are `given` by name; None keeps a value.
+    """Return the dataclass `settings` of `what` with the `given` values by name; None keeps a value.
 
     Raises:
         ConfigError: if there is no setting of a name.

@@ -226,8 +226,7 @@ class AppearanceConfig(TrainConfig):
     """Initial learning rate of affine functions, exposures, tone curves and grids."""
     eval_appearance: HeldOutAppearance = "mean"
     """Appearance of held-out images. mean: the mean of the training images'; half: optimised on the left half of each
-    image, with metrics of the right half (NeRF-W's protocol); nearest: that of the training image whose camera is
-    nearest."""
+    image, with metrics of the right half (NeRF-W's protocol); nearest: the training image's with the nearest camera."""
     mean_appearance_share: float = 0.25
     """Probability of training an image with the mean appearance, so that the model learns to render it."""
 

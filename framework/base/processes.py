@@ -84,7 +84,7 @@ def joined_processes() -> Iterator[Processes]:
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Treat this process as the only one within a `with` block, for work that it then sends to the others."""
+    """Treat this process as the only one within a `with` block, for work with a result that is sent to the others."""
     global _joined
     before, _joined = _joined, Processes()
     try:

@@ -36,8 +36,8 @@ class EvalFlags(GeometryFlags, RunFlags):
     """Rays averaged per pixel. Default: the run's setting."""
     eval_appearance: HeldOutAppearance | None = None
     """Appearance of held-out images. mean: the mean of the training images'; half: fitted to the left half of each
-    image, with metrics of the right half (NeRF-W's protocol); nearest: that of the training image whose camera is
-    nearest. Default: the run's setting."""
+    image, with metrics of the right half (NeRF-W's protocol); nearest: the training image's with the nearest camera.
+    Default: the run's setting."""
     lpips_weights: Path | None = None
     """File of LPIPS weights with AlexNet (.npz). Default: the run's setting."""
     max_error: str | None = None

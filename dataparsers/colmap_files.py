@@ -1,7 +1,7 @@
 """Validation of COLMAP's binary files: whether they hold the number of records that they state.
 
-pycolmap trusts the count at the beginning of a file. From a truncated file it creates cameras from uninitialised
-memory, or reads without end. So each file is traversed once, record by record, before it is read.
+pycolmap trusts the count at the beginning of a file. It reads cameras in a truncated file from uninitialised memory, or
+reads without end. So each file is traversed once, record by record, before it is read.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ steps."""
 MARCHED_REASON = "marched samples carry no gradient to rays"
 """Reason for not refining inexact poses."""
 MARCHED_SAMPLES = 2**16
-"""Samples per training step with an occupancy grid, about as many as 2,048 rays have with proposals."""
+"""Samples per training step with an occupancy grid, about the number of 2,048 rays with proposals."""
 
 
 @dataclass(frozen=True)

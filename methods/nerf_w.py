@@ -37,7 +37,7 @@ from nerfloom.samplers.proposal import half_edge
 PAPER_WIDTH, GRID_WIDTH = 256, 64
 """Features per hidden layer: the paper's networks, with half as many in their heads, and networks on a hash grid."""
 PAPER_RATE = 0.05
-"""Learning rate of the paper's networks, relative to that of a hash grid: 5e-4 by default."""
+"""Learning rate of the paper's networks, relative to a hash grid's: 5e-4 by default."""
 START = 0.05
 """Transient density before training, per half edge of the box."""
 SAMPLES = 2**15

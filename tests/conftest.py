@@ -35,7 +35,7 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish() -> None:
-    """From here on only objects of tests are looked through."""
+    """Only objects of tests are looked through from here on."""
     gc.collect()
     gc.freeze()
     gc.enable()

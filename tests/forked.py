@@ -1,7 +1,7 @@
 """Python programs in processes of their own that share one import of torch, which takes more than a second.
 
 They are forked from a process that has done nothing else. So they can die, and depend on variables of the environment;
-but torch's own variables, such as those of OpenMP, it has read already, and programs about imports belong into a
+but torch's own variables, such as OpenMP's, it has read already, and programs about imports belong into a
 process of their own from its start.
 """
 

@@ -1,4 +1,4 @@
-"""Batches: each ray goes through the pixel whose colour it has."""
+"""Batches: each ray goes through the pixel of its colour."""
 
 from collections.abc import Callable
 from dataclasses import replace

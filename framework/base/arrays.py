@@ -17,7 +17,7 @@ HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.re
 def read_array(path: Path) -> np.ndarray:
     """Read the array of a .npy file.
 
-    The memory allocated is at most the size of the file, whatever shape the header claims.
+    The memory allocated is at most the size of the file, for any shape in the header.
 
     Args:
         path: the file.

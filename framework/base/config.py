@@ -137,7 +137,7 @@ class TrainConfig:
     """Adam's epsilon."""
     masks: Literal["auto", "ignored", "empty", "off"] = "auto"
     """Meaning of masked-out pixels in training. ignored: unknown content; empty: empty space, as around a cut-out
-    object; off: none, masks are not read; auto: empty in formats whose masks show an object, and if masks remove over
+    object; off: none, masks are not read; auto: empty in formats with masks of an object, and if masks remove over
     half of all pixels and differ between images, else ignored."""
     background: Literal["auto", "random", "white", "black"] = "auto"
     """Colour behind transparent pixels in training; auto: random if images have alpha. Evaluation: white or black."""

@@ -139,7 +139,7 @@ def vis_answer(value: str) -> str | None:
 
 
 def taken(words: list[str], known: Collection[str]) -> tuple[list[str], list[str]]:
-    """Replace nerfstudio's flags and formats in a command line by those with the same meaning here.
+    """Replace nerfstudio's flags and formats in a command line by the equivalents here.
 
     All other words stay as they are.
 

@@ -38,7 +38,7 @@ class Optimised:
     """True if the parameters are tables (E, F) and a step updates only the entries that it used."""
 
     def within(self, outer: Optimised) -> Optimised:
-        """Return these settings, with values of None replaced by those of `outer`."""
+        """Return these settings, with values of None replaced by the values of `outer`."""
         own = {name: value for name, value in vars(self).items() if value is not None}
         return dataclasses.replace(outer, **own)
 

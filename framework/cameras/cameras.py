@@ -32,7 +32,7 @@ CENTER = torch.zeros(1, 2)
 TESTED_POSITIONS = 9
 """Number of positions tested along each side of an image, edges included, to find the iterations that a lens needs."""
 COMPILED = ("pinhole", *DISTORTED)
-"""Models whose rays are compiled, in the order of the kernel's enumeration."""
+"""Models with compiled rays, in the order of the kernel's enumeration."""
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class Ndc:
         slope = directions[:, :2] / depth[:, None]
         size = frame.new_tensor([self.half_width, self.half_height])
         start = (origins[:, :2] + (self.near + origins[:, 2:]) * slope) / (self.near * size)
-        # At infinity, the position depends on the direction alone.
+        # The position at infinity depends on the direction alone.
         change = torch.cat([slope / size - start, torch.full_like(depth[:, None], 2.0)], dim=-1)
         length = change.norm(dim=-1)
         radii = rays.pixel_radii

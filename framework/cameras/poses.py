@@ -21,7 +21,7 @@ NEAR = 0.05
 NEAR_SHARE = 0.5
 """Near distance as a fraction of the distance to the nearest sparse points."""
 SMALL_VIEW = 0.5
-"""Scenes whose images show less than this where their cameras look are enlarged (`enlargement`), scene units."""
+"""Minimum width of the view where cameras look, scene units; a smaller scene is enlarged (`enlargement`)."""
 MIN_SHARE_LOOKING = 0.9
 """Fraction of the cameras that must see the common point they look at, for a scene to be enlarged."""
 Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)

@@ -17,7 +17,7 @@ QUANTILES = (10, 25, 50, 75, 90)
 MIN_PIXELS = 64
 """Minimum number of usable pixels; images with fewer are ignored."""
 APPEARANCE_STOPS = 0.13
-"""Minimum spread in stops for varying light. Of seven captures, five in steady light had 0.02 to 0.09; one with dimmed
+"""Minimum spread in stops for varying light. Five of seven captures, in steady light, had 0.02 to 0.09; one with dimmed
 lamps had 0.20, and one gathered from many cameras and days had 0.29."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 

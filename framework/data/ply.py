@@ -110,7 +110,7 @@ def vertices(file: Path, header: PlyHeader) -> PlyElement:
 def read_columns(file: Path, element: PlyElement, names: Sequence[str]) -> list[np.ndarray]:
     """Read properties of an element, (count,) each: in the file's type from a binary file, float64 from an ascii one.
 
-    The memory allocated is bounded by the size of the file, whatever count its header claims.
+    The memory allocated is bounded by the size of the file, for any count in its header.
 
     Args:
         file: path of the PLY file.

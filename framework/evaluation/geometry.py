@@ -134,11 +134,11 @@ class Geometry:
     side: float
     """Longest side of the reference's bounding box."""
     accuracy: Distances
-    """From the reconstruction to the reference."""
+    """Distances from the reconstruction to the reference."""
     completeness: Distances
-    """From the reference to the reconstruction."""
+    """Distances from the reference to the reconstruction."""
     f_scores: tuple[FScore, ...]
-    """At several distances, in ascending order."""
+    """F-scores at several distances, in ascending order."""
     normals: NormalError | None
     """None if the reference has no normals."""
     left_out: LeftOut

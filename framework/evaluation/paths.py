@@ -23,7 +23,7 @@ from nerfloom.renderable import Renderable
 MIN_JUMP = 5.0
 """A walk counts as jumping if a step exceeds this multiple of the median step."""
 AROUND, ABOVE, OPENING = 1.0, math.radians(20), 50.0
-"""Of cameras around a scene: distance from its middle in edges of its box, elevation in radians, field of view in
+"""Place of cameras around a scene: distance from its middle in edges of its box, elevation in radians, field of view in
 degrees."""
 MIN_CAMERAS = 3
 """Minimum number of cameras between two jumps; shorter stretches are left out of an interpolated path."""

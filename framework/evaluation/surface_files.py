@@ -79,7 +79,7 @@ def _triangles(file: Path, kind: str) -> tuple[Tensor, Tensor]:
 
     options: dict[str, Any] = {"ply": {"fix_texture": False}, "obj": {"skip_materials": True}}.get(kind, {})
     try:
-        # From an open file, so that no other file is read.
+        # An open file is passed, so that no other file is read.
         with file.open("rb") as stream:
             loaded: Any = trimesh.load(stream, file_type=kind, process=False, **options)
         scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)

@@ -26,7 +26,7 @@ the box."""
 
 
 class BoxField(Field):
-    """A field whose encoding covers a box, or all of space contracted around the box.
+    """A field with an encoding of a box, or of all of space contracted around the box.
 
     Args:
         box: (2, 3) corners of the box, scene units.

@@ -1,7 +1,7 @@
 """Jobs on a Ray cluster that shares a file system with this machine; without an address, on this machine alone.
 
 Ray decides where a job runs and notices lost workers. A job's output and results are files, which the worker writes
-where this process reads them, so they are the same as those of local processes. A job of a lost worker is resumed
+where this process reads them, so they are the same as with local processes. A job of a lost worker is resumed
 elsewhere. Ray: Moritz et al. 2018, "Ray: A Distributed Framework for Emerging AI Applications".
 """
 
@@ -39,7 +39,7 @@ class Ray(Launcher):
     """The launcher of jobs on a Ray cluster.
 
     Args:
-        at_once: maximum number of simultaneous jobs; None for as many as there is room for.
+        at_once: maximum number of simultaneous jobs; None for all that have room.
         address: address of a running cluster, such as 10.0.0.1:6379 or auto; None to start one on this machine.
     """
 

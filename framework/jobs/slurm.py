@@ -28,7 +28,7 @@ class Slurm(Launcher):
 
     Args:
         folder: folder of the script, on a file system that the cluster's machines share.
-        at_once: maximum number of simultaneous jobs; None for as many as Slurm has room for.
+        at_once: maximum number of simultaneous jobs; None for all that Slurm has room for.
     """
 
     folder: Path

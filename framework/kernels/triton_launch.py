@@ -81,7 +81,7 @@ def optical_depth(sigma, delta):
         sigma: densities.
         delta: lengths.
     """
-    # By comparisons, not minima, so that NaN stays.
+    # Comparisons, not minima, keep NaN.
     density = tl.where(sigma > MAX_FLOAT, MAX_FLOAT, sigma)
     length = tl.where(delta > MAX_FLOAT, MAX_FLOAT, delta)
     tau = density * length

@@ -6,7 +6,7 @@ covariances C, the weights of a group are w ~ o S, which sum to 1, and the merge
 
     m' = sum w m        C' = sum w (C + (m - m') (m - m')^T)        o' = sum o S / S'
 
-Colours and harmonics are means with the same weights. By Cauchy's formula, the projected area of a convex body is a
+Colours and harmonics are means with the same weights. Cauchy's formula: the projected area of a convex body is a
 quarter of its surface, averaged over all directions. So o' keeps the coverage of the image, unless it would exceed 1:
 then Gaussians overlap, and the merged one is opaque. The paper draws such Gaussians with a wider falloff instead.
 """

@@ -11,7 +11,7 @@ from nerfloom.kernels.octree.layout import OctreeLayout
 def moments(num_splits: int) -> list[tuple[float, bool]]:
     """Return when leaves change: spent shares of the budget, each with whether leaves are split or only dropped.
 
-    Each size of leaves lasts twice as long as the one before. Leaves are dropped in the middle and at the end of this
+    Each size of leaves lasts twice the time of the one before. Leaves are dropped in the middle and at the end of this
     time, except at the end of training.
 
     Args:

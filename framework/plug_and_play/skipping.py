@@ -79,7 +79,7 @@ class OccupancyGrid(nn.Module):
     def update(self, step: int, sigma_fn: SigmaFunction) -> None:
         """Evaluate the density in some cells and update `occupied`, every 8 steps at first and every 16 later.
 
-        Call it before each training step. By step 256 every cell has been evaluated, and occupied cells four times.
+        Call it before each training step. Every cell has been evaluated by step 256, and occupied cells four times.
 
         Args:
             step: number of the training step, from 0.

@@ -1,7 +1,7 @@
 """The lens model FisheyeRadTanThinPrism of Project Aria's cameras, also called Fisheye624.
 
-At the angle t from the axis, r = t (1 + k1 t^2 + ... + k6 t^12) is the distance from the centre; with the point p = (x,
-y) at that distance in the direction of the ray, and R = x^2 + y^2, the image shows the ray at f q + c,
+A ray at the angle t from the axis is at the distance r = t (1 + k1 t^2 + ... + k6 t^12) from the centre. With the
+point p = (x, y) at that distance in the direction of the ray, and R = x^2 + y^2, the image shows the ray at f q + c,
 
     q = p + 2 (p1 x + p2 y) p + R (p1, p2) + R (s1, s3) + R^2 (s2, s4)
 

@@ -1,7 +1,7 @@
 """Lenses of Agisoft Metashape's sensors.
 
 The camera models are in the appendix "Camera models" of its user manual: x' and y' are distorted coordinates of the
-image plane, for fisheyes those of the angle to the optical axis, and
+image plane, for fisheyes by the angle to the optical axis, and
 
     u = w / 2 + cx + x' (f + B1) + y' B2,   v = h / 2 + cy + y' f,
     x' = x (1 + K1 r^2 + K2 r^4 + K3 r^6 + K4 r^8) + (P1 (r^2 + 2 x^2) + 2 P2 x y) (1 + P3 r^2 + P4 r^4),

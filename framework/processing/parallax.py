@@ -31,7 +31,7 @@ def share_that_turned(pairs: list[tuple[np.ndarray, np.ndarray]]) -> float:
         pairs: matches of each pair, as positions (M, 2) in units of the image's longer side from its centre.
 
     Returns:
-        From 0 to 1; 0 if no pair counts.
+        The fraction, from 0 to 1; 0 if no pair counts.
     """
     telling = [(one, two) for one, two in pairs if np.median(np.linalg.norm(one - two, axis=1)) > MIN_MOTION]
     if not telling:

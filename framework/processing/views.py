@@ -51,7 +51,7 @@ class View:
     number: int
     """Number of its direction."""
     rotation: np.ndarray
-    """(3, 3) from the view's camera to that of the image, OpenGL axes."""
+    """(3, 3) from the view's camera to the image's, OpenGL axes."""
     pixels: np.ndarray
     """(S, S, C) uint8."""
     seen: np.ndarray

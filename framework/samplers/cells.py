@@ -27,7 +27,7 @@ def places(cells: Tensor, resolution: int) -> Tensor:
 def beside(cells: Tensor, resolution: int, parts: int, in_time: bool) -> Tensor:
     """Return a random neighbour (N,) int64 of each of `cells` (N,), or the cell itself.
 
-    `resolution` is that of each of `parts` boxes or slices; only if `in_time`, neighbours include adjacent slices.
+    Each of `parts` boxes or slices has this `resolution`; only if `in_time`, neighbours include adjacent slices.
     """
     n, place = resolution, places(cells, resolution).long()
     moved = place if in_time else place[:, 1:]

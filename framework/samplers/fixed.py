@@ -44,8 +44,8 @@ def sample_into_slots(
 ) -> Samples:
     """Return samples in occupied cells, up to the early stop, without waiting for the device.
 
-    The density is evaluated at all candidates, and again, with gradient, at those that light reaches. The sizes that
-    the step needed are recorded in `capacity`.
+    The density is evaluated at all candidates, and again, with gradient, at candidates that light reaches. The sizes
+    that the step needed are recorded in `capacity`.
 
     Args:
         rays: R rays, R > 0.

@@ -11,7 +11,7 @@ from nerfloom.data.scene import Scene
 
 TIMES_A_VERTEX, MIN_VERTICES, MAX_VERTICES = 6, 3, 2**10
 """Number of image times per vertex along a time axis, and the minimum and maximum number of vertices. The paper has 2
-times per vertex, for training fifty times as long as minutes on a processor: docs/notes/motion.md."""
+times per vertex, for a training fifty times as long as minutes on a CPU: docs/notes/motion.md."""
 
 
 TIMES_A_SLICE, MAX_SLICES = 9, 16

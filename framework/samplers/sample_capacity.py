@@ -29,7 +29,7 @@ class Sizes(NamedTuple):
     runs: int
     """For runs of steps near an occupied cell."""
     candidates: int
-    """For steps in occupied cells, whose density is evaluated."""
+    """Capacity for steps in occupied cells, where the density is evaluated."""
     kept: int
     """For steps that light reaches."""
 

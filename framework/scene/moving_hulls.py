@@ -1,7 +1,7 @@
 """Visual hulls of a moving scene: space that transparent pixels show to be empty at a time.
 
-The ray of a transparent pixel is empty at the time of its image. At another moment, a ball is empty if the image shows
-a larger ball to be empty. The radius grows by the distance that matter moves in between (`nerfloom.scene.speed`). So a
+The ray of a transparent pixel is empty at the time of its image. A ball is empty at another moment if the image shows a
+larger ball to be empty. The radius grows by the distance that matter moves in between (`nerfloom.scene.speed`). So a
 cell may be occupied at a moment if no image shows the ball around it to be empty, and if `WITNESSES` of the images near
 that moment show matter in its direction.
 """

@@ -1,8 +1,8 @@
 """Capacity of the lists of Gaussians per tile, estimated from earlier images.
 
-The number of entries is known on the device only. A device that runs ahead of Python records it for each image. At the
-next synchronisation these records set the capacity for later images. Each image synchronises until the capacity for its
-size is known. Entries beyond the capacity are dropped and counted.
+The number of entries is known on the device only. A device that runs ahead of Python records it for each image. These
+records set the capacity for later images at the next synchronisation. Each image synchronises until the capacity for
+its size is known. Entries beyond the capacity are dropped and counted.
 """
 
 from __future__ import annotations

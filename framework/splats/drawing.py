@@ -27,7 +27,7 @@ EWA_ANGLE = math.radians(89)
 """Largest angle from the optical axis for elliptical weighted averaging, which shows less than 90 degrees. Images of a
 fisheye that show more are drawn by the unscented transform, like panoramas."""
 FLIPPED = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-"""From a camera's axes (x right, y up, looking along -z) to the axes of splatting (x right, y down, z forward)."""
+"""Maps a camera's axes (x right, y up, looking along -z) to the axes of splatting (x right, y down, z forward)."""
 
 
 def smallest_depth(scene: Scene) -> float:

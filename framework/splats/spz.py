@@ -213,8 +213,8 @@ def _with_first_three(gaussians: Gaussians) -> tuple[np.ndarray, Tensor]:
 def _with_smallest_three(gaussians: Gaussians) -> tuple[np.ndarray, Tensor]:
     """Return rotations as the bytes (N, 4) of versions 3 and 4, and the logarithms of the scales along their axes.
 
-    From the highest bit: the place of the largest component among x, y, z, w in 2 bits, then the others in their order,
-    each as a sign and 9 bits of its magnitude times sqrt(2).
+    Layout from the highest bit: the place of the largest component among x, y, z, w in 2 bits, then the others in their
+    order, each as a sign and 9 bits of its magnitude times sqrt(2).
     """
     rotations = gaussians.rotations.double().numpy()
     place, others = split(np.concatenate([rotations[:, 1:] * FLIP, rotations[:, :1]], -1))

@@ -126,7 +126,7 @@ def packed_bytes(packed: Packed) -> bytes:
 def read_packed(file: Path) -> Packed:
     """Read the content of a file of any version, decompressed.
 
-    The memory allocated is bounded by the size of the file, whatever its header claims.
+    The memory allocated is bounded by the size of the file, for any size in its header.
 
     Args:
         file: path of the file.

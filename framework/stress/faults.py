@@ -23,7 +23,7 @@ Spoil = Callable[[Any, int], Any]
 def spoiled_pixel(value: float) -> Spoil:
     """Return a function that sets all channels of a pixel to `value` in every third batch, from the first.
 
-    At least that many steps must be dropped (`spoiled_batches`); a method that drops fewer hides the fault.
+    Minimum number of dropped steps (`spoiled_batches`); a method that drops fewer hides the fault.
     """
 
     def spoil(batch: Any, step: int) -> Any:

@@ -18,7 +18,7 @@ Outcome = Literal["pass", "degraded", "refused", "fail", "not applicable"]
 """Outcome of a run. refused: it ended with a clear error, which is accepted instead of a result. not applicable: there
 was no run, because the condition does not affect the method."""
 MIN_LEARNT = 3.0
-"""Minimum PSNR of the plain run above that of empty images, dB; with a lower one, every run would pass."""
+"""Minimum PSNR of the plain run above the PSNR of empty images, dB; with a lower one, every run would pass."""
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ class BlockPlan:
             own += ["--placement", str(self._home(number) / "placement.json")]
         own += ["--train-image-indices", *map(str, block.cameras)]
         device = ["--machine.device-type", self.device_type]
-        # Of two equal flags the last counts.
+        # The last of two equal flags counts.
         command = [*python_command("nerfloom.cli.train", self.method), *ALONE, *device, *threads, *self.flags, *own]
         resume = python_command("nerfloom.cli.train", "--resume", run)
         return Job(

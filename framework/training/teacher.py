@@ -145,7 +145,7 @@ def load_teacher(path: Path, dataset: Dataset) -> Teacher:
     except NerfloomError as error:
         raise ConfigError(f"--teacher: {error}") from error
     finally:
-        torch.set_num_threads(threads)  # the pupil's number, not that of the teacher's settings
+        torch.set_num_threads(threads)  # the pupil's number, not the number in the teacher's settings
     teacher = Teacher(loaded.model, loaded.input_placement, dataset.placement)
     if (reason := _unsuitable(loaded, teacher, dataset)) is not None:
         raise ConfigError(f"--teacher {path}: {reason}")

@@ -130,7 +130,7 @@ def _interpolated(settings: InterpolateSettings, loaded: Loaded) -> Views:
 
 
 def about(walk: Walk, count: int) -> list[str]:
-    """Return sentences about those of `count` cameras that a `walk` leaves out, and about its jumps."""
+    """Return sentences about cameras, of `count`, that a `walk` leaves out, and about its jumps."""
     said = []
     if left := count - sum(map(len, walk.stretches)):
         said.append(f"the path leaves out {left} of {count} photographs, which are far from all others")

@@ -62,7 +62,7 @@ class Speed:
         return fixed + each * rays
 
     def rays(self, seconds: float) -> float:
-        """Return the number of rays of a picture that takes `seconds`, at least as long as the fixed part."""
+        """Return the number of rays of a picture that takes `seconds`, but not less than the fixed part."""
         fixed, each = self.line()
         return max(seconds - fixed, fixed, 0.2 * seconds) / max(each, 1e-12)
 

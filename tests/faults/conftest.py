@@ -37,7 +37,7 @@ def disk(tmp_path: Path) -> Iterator[Disk]:
 
 @pytest.fixture
 def read_only(tmp_path: Path) -> Iterator[Callable[[Path], None]]:
-    """Takes the right to write to a folder away, for as long as the test runs."""
+    """Takes the right to write to a folder away, until the test ends."""
     if os.name != "posix" or os.geteuid() == 0:
         pytest.skip("root may write to any folder")
     changed = []

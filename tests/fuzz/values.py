@@ -14,9 +14,9 @@ NAMES = (
     "a\0b", "\x1b[2J", "\ud800", 300 * "a", 3000 * "a/", 200 * "\u00e9", "a\\b", "C:\\x", "~", "%s", "{0}",
     "con", "-rf",
 )  # fmt: skip
-"""Of files."""
+"""Names of files."""
 LETTERS = ("\0", "\ufeff", "\r", "\u2028", "\x1b[31m", "\ud800", "\u0663", "\U0001f600", "\t", "\n\n", "'", '"', "\\")
-"""That come as a surprise in text."""
+"""Characters that come as a surprise in text."""
 DEEP = "@deep@"
 """Stands for something nested deeper than one would nest anything."""
 DEPTHS = (60, 500, 900, 950, 985, 100_000)
@@ -24,4 +24,4 @@ DEPTHS = (60, 500, 900, 950, 985, 100_000)
 PLAIN = (
     None, True, False, *WHOLE, -(2**63), 10**400, *REAL, *NAMES, "nan", "1", [], {}, [[]], [1], ["x"], {"a": 1}, DEEP,
 )  # fmt: skip
-"""Whatever JSON can hold."""
+"""All kinds of values in JSON."""

@@ -49,7 +49,7 @@ def case(kind: str, dtype: torch.dtype = F64) -> tuple[Samples, Tensor, Tensor, 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("kind", ["soft", "with zeros", "with ones", "all ones"])
 def test_value_and_gradient_are_those_of_the_product(kind: str, dtype: torch.dtype) -> None:
-    """float32 takes the compiled kernel where there is one. At an alpha of 1 the bound is the documented sqrt(eps)."""
+    """float32 takes the compiled kernel where there is one. The bound at an alpha of 1 is the documented sqrt(eps)."""
     samples, alpha, rgb, background, fars = case(kind, dtype)
     draws = torch.Generator().manual_seed(4)
     seeds = [torch.randn(shape, generator=draws, dtype=F64) for shape in ((5, 3), (5,), (len(samples),))]

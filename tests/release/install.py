@@ -68,7 +68,7 @@ class Environment:
         return found[1]
 
     def train(self, data: Path | None, limit: str) -> str:
-        """Train instant-ngp for as long as the flag `limit` says; the PSNR of a few held-out images."""
+        """Train instant-ngp up to the flag `limit`; return the PSNR of a few held-out images."""
         words = ["instant-ngp", *(["--data", data] if data else []), *limit.split(), "--max-eval-images", 4]
         words += ["--vis", "none", "--timestamp", "t", "--output-dir", self.folder / "outputs"]
         own = {"NERFLOOM_CACHE": str(self.folder / "cache"), **NO_COMPILER}

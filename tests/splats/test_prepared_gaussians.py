@@ -26,7 +26,7 @@ def cloud(count: int = 700) -> Gaussians:
 
 
 def test_every_picture_is_the_first() -> None:
-    """But for Gaussians as far as others, which come in another order; here there are none."""
+    """Gaussians at equal distances come in another order; here there are none."""
     seen, background = splat_camera(camera(), near=0.1), torch.rand(3)
     truth = draw_colors(cloud(), seen, 1, background)
     redrawn = PreparedGaussians(cloud(), RASTERISER)

@@ -37,7 +37,7 @@ def backends(**broken: str) -> pytest.MarkDecorator:
     """Run a test, which takes a `backend`, on each of them.
 
     Args:
-        broken: backends on which it is known to fail, and why.
+        broken: backends with known failures, and their reasons.
     """
     params = []
     for name in BACKENDS:

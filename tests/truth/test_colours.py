@@ -86,7 +86,7 @@ def test_a_photograph_with_alpha_is_judged_over_white_and_one_without_over_black
 
 
 def test_what_is_judged_of_a_photograph_with_alpha_is_how_it_looks_over_white(folder: Path, tmp_path: Path) -> None:
-    """A model that shows nothing shows the background: its error is that of white paper."""
+    """A model that shows nothing shows the background: its error is white paper's."""
     trainer = tiny_trainer("instant-ngp", folder, tmp_path / "run", silhouette_cells=False, sampler="occupancy")
     trainer.model.sampler.carve(torch.zeros_like(trainer.model.sampler.occupied))
     found = evaluate(trainer.model, trainer.train_set)

@@ -2,7 +2,8 @@
 
 Sparse Adam updates an entry only if its gradient is not zero. The moments of the entry decay, and their bias is
 corrected, by the number of its updates, not by the number of steps. So an entry first used after a thousand steps moves
-as far as in a first step. (Instant-NGP's optimiser skips entries in the same way; Mueller et al. 2022, section 4.)
+by the same length as in a first step. (Instant-NGP's optimiser skips entries in the same way; Mueller et al. 2022,
+section 4.)
 """
 
 from __future__ import annotations

@@ -31,10 +31,10 @@ class _Waiting(torch.autograd.Function):
 
 
 def waiting(table: Tensor, positions: Tensor, width: int, parts: Parts) -> Tensor:
-    """Return a placeholder for the table of a look-up, whose backward appends the look-up's gradient to `parts`.
+    """Return a placeholder for the table of a look-up; its backward appends the look-up's gradient to `parts`.
 
-    It does so only in a backward pass that computes the gradient of the table: `backward()`, or one whose `inputs`
-    contain the table. `autograd.grad` of the table gets no gradient; use a look-up without `deferred` for that.
+    It does so only in a backward pass that computes the gradient of the table: `backward()`, or one with the table
+    among its `inputs`. `autograd.grad` of the table gets no gradient; use a look-up without `deferred` for that.
 
     Args:
         table: (E, F) parameters.

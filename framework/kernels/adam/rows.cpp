@@ -6,7 +6,8 @@ namespace {
 constexpr int64_t ROWS = 1024, VALUES = 1 << 15;  // of a chunk, at most; a chunk has a row or more
 constexpr int64_t AHEAD = 8;                      // rows that are fetched before they are used
 
-// By value and without aliases, so that the compiler takes whole vectors. F values, or `features` if F is 0.
+// Arguments are by value and without aliases, so that the compiler uses whole vectors. A row has F values, or
+// `features` if F is 0.
 template <int F>
 void update_row(float* __restrict p, float* __restrict m, float* __restrict v, const float* __restrict g, int features,
                 float keep1, float add1, float keep2, float add2, float unbias2, float step, float eps) {

@@ -38,7 +38,7 @@ EXPORT int composite_forward(const float* sigma, const float* rgb, const float* 
     });
 }
 
-// From the gradients of colour (R, 3), opacity (R) and weights (N); the last two may be null. With
+// Inputs are the gradients of colour (R, 3), opacity (R) and weights (N); the last two may be null. With
 // g_i = dL/dw_i:  dL/dtau_i = g_i T_{i+1} - sum_{j > i} g_j w_j.
 EXPORT int composite_backward(const float* sigma, const float* rgb, const float* starts, const float* ends,
                               const int64_t* offsets, int64_t rays, int64_t samples, const float* background,

@@ -159,7 +159,7 @@ def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, 
 
 @triton.jit
 def _distortion(weights, starts, ends, offsets, loss, of_weights, BLOCK: tl.constexpr):
-    # The distance of two middles is the sum of the gaps between them. From behind, a gap counts with all weight in
+    # The distance of two middles is the sum of the gaps between them. Seen from behind, a gap counts with all weight in
     # front of it; from in front, with all weight behind it. No term is negative, so nothing cancels.
     ray = tl.program_id(0).to(tl.int64)
     begin = tl.load(offsets + ray)

@@ -1,6 +1,6 @@
 """Multiresolution hash encoding: Instant-NGP (Mueller et al. 2022), section 3.
 
-Level l is a grid of resolution r_l = floor(r_0 * b^l). A level whose vertices fit into its table is stored densely; a
+Level l is a grid of resolution r_l = floor(r_0 * b^l). A level is stored densely if its vertices fit into its table; a
 finer one is hashed (equation 4). The features at a position are interpolated trilinearly between the 8 corners of its
 cell.
 """

@@ -74,7 +74,7 @@ inline Floats shrink(Floats* x, Floats& inverse_norm) {
     return inverse_norm * inverse_largest;
 }
 
-// From a position in half edges to the unit cube; `shrunk` becomes the cube root of the contraction's determinant.
+// Maps a position in half edges to the unit cube; `shrunk` becomes the cube root of the contraction's determinant.
 inline void contract(Floats* x, Floats& shrunk) {
     Floats inverse_norm;
     const Floats inverse = shrink(x, inverse_norm);

@@ -120,7 +120,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights:
         A tensor without dimensions.
 
     Raises:
-        ValueError: The shapes differ or are not those of images.
+        ValueError: The shapes differ or do not fit images.
     """
     _check(image, target)
     if weights is not None and weights.shape != image.shape[:2]:

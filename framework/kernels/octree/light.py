@@ -8,8 +8,8 @@ equation 3). With the length l_i of a ray in leaf i, and c_i the leaf's harmonic
 
 A colour is linear in a leaf's coefficients, as in Plenoxels (Fridovich-Keil et al. 2022) without its clamp: it is
 clamped once, in the finished pixel. So coefficients are summed along a ray, and meet the harmonics of its direction
-once. A ray ends when T is below `stop`: matter behind this point shows as background. By Cauchy-Schwarz and Unsoeld's
-theorem a leaf's channel is at most |c| (degree + 1) / sqrt(4 pi), where |c| is the norm of its coefficients; so the
+once. A ray ends when T is below `stop`: matter behind this point shows as background. A leaf's channel is at most |c|
+(degree + 1) / sqrt(4 pi), where |c| is the norm of its coefficients (Cauchy-Schwarz and Unsoeld's theorem); so the
 error of a channel is at most `stop` times the sum of this bound and the background (`error_bound`).
 """
 

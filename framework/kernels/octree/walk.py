@@ -1,6 +1,6 @@
 """The leaves of an octree along rays, in order: the reference of `walk.h`.
 
-A grid with coarser ones around it is one of several levels. At each point of a ray, the finest level shows the ray if
+A grid with coarser ones around it is one of several levels. The finest level shows a point of a ray if
 the point is in its box and if a pixel there is at most `CELLS_PER_PIXEL` of its cells wide. So a ray changes levels
 where it crosses the faces of boxes, and where its pixel has become too wide. A pixel samples an octree at one position:
 without coarser levels, it would show one of many leaves.

@@ -387,7 +387,7 @@ EXPORT int splat_blend(const float* records, int64_t count, const int32_t* offse
     });
 }
 
-// From the gradients of image and transmittance (the latter may be null) the sums of each entry, by slot.
+// Computes the sums of each entry, by slot, from the gradients of image and transmittance (the latter may be null).
 EXPORT int splat_blend_backward(const float* records, int64_t count, const int32_t* offsets, const int32_t* ids,
                                 const int32_t* slots, int64_t entries, int width, int height, int channels,
                                 const float* image, const float* through, const uint64_t* blended,

@@ -39,7 +39,7 @@ inline Floats logarithm(Floats x) {
     return (m + (m * square * p - 2.12194440e-4f * e - 0.5f * square)) + 0.693359375f * e;
 }
 
-// From (x, y) = (tan t cos f, tan t sin f) to (t cos f, t sin f), as in a fisheye: the common factor, and the Jacobian.
+// Maps (x, y) = (tan t cos f, tan t sin f) to (t cos f, t sin f), as in a fisheye: the common factor, and the Jacobian.
 // This mapping and a fisheye's Bent are functions of the radius, so the product of their Jacobians is symmetric.
 struct ToAngle {
     double scale = 1, xx = 1, xy = 0, yy = 1;

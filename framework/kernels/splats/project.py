@@ -11,7 +11,7 @@ Gaussian of mean m, axes R and scales s is on the image
 multiplied by sqrt(det(T T^T) / det(covariance)) (Mip-Splatting, Yu et al. 2024, section 4.2).
 
 A lens bends the image: J is then of the bent position, and the lens's own Jacobian counts as constant in gradients.
-By EWA a fisheye shows points less than 90 degrees from the camera's axis.
+EWA shows points less than 90 degrees from the camera's axis in a fisheye image.
 
 Cameras that show more are `unscented`: seven points of each Gaussian, which the lens projects exactly, then give its
 centre and covariance on the image (`unscented.py`). Everything else is the same.

@@ -117,7 +117,7 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
         radius = radii[paths.rays] * paths.t
         paths = _noted(paths, value)
         covered = (paths.outside > -torch.inf) & (paths.least <= -radius) | value.isnan()  # a broken field shows
-        # At least a few units in the last place, so that a ray far away ends too.
+        # The length is at least a few units in the last place, so that a ray far away ends too.
         step = value.abs().clamp(min=shortest).maximum(radius / 2).maximum(4 * torch.finfo(value.dtype).eps * paths.t)
         to = paths.t + step
         piece = torch.searchsorted(ends, paths.rays * span + to.double(), right=True)

@@ -60,11 +60,11 @@ class Constants(NamedTuple):
     kept: int
     """Maximum number of blocks in memory."""
     small: int
-    """Longer side of the small pictures of training images, pixels."""
+    """Minimum length of the longer side of the small pictures of training images, pixels."""
     looked: int
     """Number of training images that a visibility network learns from."""
     matched: int
-    """Maximum number of images by which two blocks are matched."""
+    """Maximum number of shared images that match the colours of two blocks."""
     coarse: int
     """Shorter side of the picture with rays for visibility, pixels."""
     shares: int
@@ -124,8 +124,8 @@ def measured(results: Path) -> Measured:
     """Return the measured values in a folder of results.
 
     Args:
-        results: folder with methods-procedural.json (`ns-bench methods`) and city.json, either of which may be missing.
-            city.json may have values by the names of `Measured`, which take precedence.
+        results: folder with methods-procedural.json (`ns-bench methods`) and city.json. Each file may be missing. Values
+            in city.json have the names of `Measured` and take precedence.
     """
     runs = _read(results / "methods-procedural.json").get("runs", [])
     own: dict[str, Any] = next((run for run in runs if run["method"] == METHOD), {})

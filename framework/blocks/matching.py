@@ -16,9 +16,9 @@ from nerfloom.cameras.view import View
 from nerfloom.rendering.light import without_background
 
 MAX_VIEWS = 6
-"""Maximum number of images by which two blocks are matched."""
+"""Maximum number of shared images that match the colours of two blocks."""
 SIDE = 48
-"""Longer side of the pictures that are compared, pixels, at most twice this."""
+"""Minimum length of the longer side of the compared pictures, pixels. It is less than twice this."""
 
 
 def matched(model: Blocks, cameras: Cameras, times: Tensor | None) -> list[TrainedBlock]:

@@ -54,8 +54,8 @@ def reduce_to(edited: Edited, count: int, refit_steps: int = 0) -> Edited:
 
     Args:
         count: maximum number of Gaussians.
-        refit_steps: number of steps in which the kept Gaussians learn to look like all of them, from the cameras of the
-            training images; 0 for none.
+        refit_steps: number of training steps that make the kept Gaussians look like all of them, from the cameras of
+            the training images; 0 for none.
 
     Raises:
         ConfigError: if Gaussians cannot be drawn for the cameras of the photographs, or refitting lacks photographs.

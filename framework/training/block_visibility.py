@@ -23,7 +23,7 @@ from nerfloom.training.trained import load_trained
 MAX_SIGHTS = 128
 """Maximum number of training images that are rendered."""
 SIDE = 48
-"""Longer side of their pictures, pixels, at most twice this."""
+"""Minimum length of the longer side of their pictures, pixels. It is less than twice this."""
 POINTS = 2**16
 """Number of points to learn from."""
 STEPS, BATCH, RATE = 500, 4096, 5e-3

@@ -106,7 +106,7 @@ def test_reduced_images_of_record3d(tmp_path: Path) -> None:
 @pytest.mark.parametrize("away", [0.0, 5000.0])
 def test_points_of_record3d_move_with_the_poses(away: float, tmp_path: Path) -> None:
     """Those of all files of a folder, also far from the origin; a point that a camera sees is where its ray leads."""
-    folder, expected = write_record3d(tmp_path / "recording"), POINTS + [0.0, away, 0.0]
+    folder, expected = write_record3d(tmp_path / "recording"), POINTS + np.array([0.0, away, 0.0])
 
     def move(content: Content) -> None:
         for pose in content["poses"]:

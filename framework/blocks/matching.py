@@ -1,4 +1,4 @@
-"""Search for the colours in which blocks match their neighbours, by pictures of the images that they share."""
+"""Search for colours that make blocks match their neighbours, by pictures of the images that they share."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIDE = 48
 
 
 def matched(model: Blocks, cameras: Cameras, times: Tensor | None) -> list[TrainedBlock]:
-    """Return the blocks of a model with the colours in which they match their neighbours.
+    """Return the blocks of a model with colours that match their neighbours.
 
     The block that shares most images keeps its colours; the others follow from neighbour to neighbour.
 

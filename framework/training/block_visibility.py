@@ -68,7 +68,7 @@ def fitted(network: Visibility, points: Tensor, directions: Tensor, labels: Tens
     Args:
         network: a new network.
         points: (N, 3) positions in the input's frame.
-        directions: (N, 3) unit directions in which they are looked at, in the input's frame.
+        directions: (N, 3) unit directions from a camera to each point, in the input's frame.
         labels: (N,) their transmittances.
     """
     inputs, random = network.inputs(points, directions), torch.Generator().manual_seed(0)

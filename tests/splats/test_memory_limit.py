@@ -144,6 +144,16 @@ def test_a_run_with_a_limit_is_one_without(shared_tiny: Path, tmp_path: Path) ->
 
 
 @needs_kernels
+def test_tables_in_files_may_be_larger_than_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limited, free = built(tmp_path, memory_limit=50.0), built(tmp_path)
+    size = 12.0 * sum(column.numel() for column in free.parameters())
+    monkeypatch.setattr("nerfloom.kernels.table_memory.machine_memory", lambda: 0.5 * size)
+    make_optimizer(limited, limited.config)
+    with pytest.raises(ConfigError, match="for the model's parameters and Adam's state"):
+        make_optimizer(free, free.config)
+
+
+@needs_kernels
 def test_what_has_no_limit_is_refused() -> None:
     config, _ = decide(GaussianSplattingConfig(memory_limit=1.0, machine=CPU), SCENE)
     check_limit(config, SCENE)

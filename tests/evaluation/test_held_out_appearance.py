@@ -14,7 +14,7 @@ from nerfloom.evaluation.appearance import fit_appearance, held_out_appearance, 
 from nerfloom.fields.appearance import Appearance
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.color import to_linear, to_srgb
-from nerfloom.rendering.light import make_light
+from nerfloom.rendering.light import Light, make_light
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.testing.ball import cameras_at
 from nerfloom.testing.scenes import ball_in_a_box
@@ -82,11 +82,15 @@ class LitBall(ExactBall):
         super().__init__(scene)
         light = make_light(AppearanceConfig(appearance=kind), scene)  # type: ignore[arg-type]
         assert light is not None
-        self.appearance = light
+        self.light = light
+
+    @property
+    def appearance(self) -> Light:
+        return self.light
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
         shown = super().render(rays, background)
-        return replace(shown, rgb=self.appearance.lit(shown.rgb, shown.accumulation, background))
+        return replace(shown, rgb=self.light.lit(shown.rgb, shown.accumulation, background))
 
 
 @pytest.mark.parametrize("kind", ["affine", "tone", "grid"])

@@ -114,7 +114,7 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     @property
     def appearance(self) -> Appearance | None:
-        """Appearance of the training images, of whichever part has one; None if all images have the same."""
+        """Appearance of the training images, of the part that has one; None if all images have the same."""
         return next(iter(parts(self, Appearance)), None)
 
     @property

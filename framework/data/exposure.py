@@ -52,7 +52,7 @@ def read_taken(paths: Sequence[Path]) -> tuple[Taken, ...]:
     """Read how photographs were taken from the EXIF of their files; unknown for files without or with damaged EXIF.
 
     Args:
-        paths: image files, of which some may be missing.
+        paths: image files; some may be missing.
     """
     with ThreadPoolExecutor() as pool:
         return tuple(pool.map(_read_exif, paths))
@@ -105,14 +105,14 @@ def _read_exif(path: Path) -> Taken:
         exif.load(content)
         details = exif.get_ifd(DETAILS)
         device = " ".join(f"{exif.get(tag, '')}".strip("\0 ") for tag in (MAKER, MODEL)).strip()
-        seconds, f_number, iso = (_positive(details.get(tag)) for tag in (SECONDS, F_NUMBER, ISO))
+        seconds, f_number, iso = (_number(details.get(tag)) for tag in (SECONDS, F_NUMBER, ISO))
         return Taken.of(seconds, f_number, iso, device)
     except Exception:  # of any type, by missing files and by Pillow; a damaged image is reported when it is decoded
         return Taken()
 
 
-def _positive(value: Any) -> float:
-    """Return an entry of EXIF as a number, the first of several; NaN if it is none."""
+def _number(value: Any) -> float:
+    """Return an entry of EXIF as a number, the first of several; NaN if it is not one."""
     first = value[0] if isinstance(value, tuple) and value else value
     try:
         return float(first)

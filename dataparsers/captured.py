@@ -98,6 +98,7 @@ def captured_scene(
         sightings=None if sparse.sightings is None else sparse.sightings.of_images(chosen),
         unbounded=True,
         poses=flags.poses,
+        z_is_up=flags.orientation_method in ("auto", "up"),
         depth_paths=images.depths,
         object_distances=_object_distances(flags, cameras, box) if shows_object else None,
         taken=images.taken,

@@ -351,8 +351,12 @@ def test_the_up_direction_that_a_file_states(capture: Path, stated: Any) -> None
     assert expected is not None
     assert asked is not None
     edit(capture, lambda content: content.update(orientation_override=stated))
-    assert torch.equal(Nerfstudio().parse(capture, "train").transform, expected)  # type: ignore[arg-type]
-    assert torch.equal(Nerfstudio(orientation_method="pca").parse(capture, "train").transform, asked)  # type: ignore[arg-type]
+    left_to_the_file = Nerfstudio().parse(capture, "train")
+    of_the_flag = Nerfstudio(orientation_method="pca").parse(capture, "train")
+    assert torch.equal(left_to_the_file.transform, expected)  # type: ignore[arg-type]
+    assert torch.equal(of_the_flag.transform, asked)  # type: ignore[arg-type]
+    assert load_dataset(left_to_the_file, "train").z_is_up
+    assert not of_the_flag.z_is_up
 
 
 def test_the_unit_of_depth_in_exr_is_said(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -238,7 +238,10 @@ def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> P
     """
     scene = from_original(scene, *_applied(content, file))
     if scene.transform is None or not bool(scene.transform.isfinite().all()) or not 0 < scene.scale < math.inf:
-        raise DataError(f"{file}: 'applied_transform' and 'applied_scale' give a transform out of range")
+        raise DataError(
+            f"{file}: 'applied_transform' and 'applied_scale' give a transform out of range; correct them, "
+            "or remove both"
+        )
     return scene
 
 

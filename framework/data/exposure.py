@@ -96,7 +96,7 @@ def devices_of(taken: Sequence[Taken] | None, cameras: Cameras) -> Tensor | None
 
 def _read_exif(path: Path) -> Taken:
     try:
-        read_heif(path)
+        read_heif()
         with Image.open(path) as image:
             content = image.info.get("exif")  # `Image.getexif` would decode a PNG without it
         if not isinstance(content, bytes):

@@ -78,7 +78,7 @@ def export_page(
     start = start_of([names[index] for index in order], settings.start_view)
     ranks = shown_cameras(len(order), start)
     chosen = torch.tensor([order[rank] for rank in ranks])
-    turn = upright(cameras)
+    turn = upright(cameras, dataset is not None and dataset.z_is_up)
     red, green, blue = model.background.tolist()
     facts = PageFacts(
         title=_title(loaded) if settings.title is None else printable(settings.title),

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from nerfloom.geometry.points import radii_at
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, Operation
@@ -114,7 +115,7 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
     while len(paths.rays):
         value = distance(rays.points(paths.rays, paths.t))
         evaluations += len(value)
-        radius = radii[paths.rays] * paths.t
+        radius = radii_at(paths.t, radii[paths.rays], rays.parallel)
         paths = _noted(paths, value)
         covered = (paths.outside > -torch.inf) & (paths.least <= -radius) | value.isnan()  # a broken field shows
         # At least a few units in the last place, so that a ray far away ends too.
@@ -229,7 +230,7 @@ _take: Callable[..., int] = native.Function("crossings_take", "qqppp", "q")
 def _fits(marched: March, known: SignedDistance, shortest: float, safety: float) -> bool:
     if not isinstance(marched, CompiledMarch) or marched.waves or not is_compiled(known):
         return False
-    return marched.levels == 1 and marched.cone == 0 and marched.slices is None
+    return marched.levels == 1 and marched.cone == 0 and marched.slices is None and not marched.rays.parallel
 
 
 @MARCHED_CROSSINGS.implementation(CPP, order=0, differentiable=0, fits=_fits)

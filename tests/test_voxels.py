@@ -327,7 +327,7 @@ def test_damaged_checkpoints_are_refused() -> None:
         assert "\n" not in str(error.value)
 
 
-def test_a_run_is_written_as_an_octree() -> None:
+def test_a_run_is_written_as_an_octree(capsys: pytest.CaptureFixture[str]) -> None:
     """Without learning anew; where a file must be smaller, with the leaves that images see best."""
     model, rays = filled(), some_rays()
     datasets = {"train": ball_in_a_box()}
@@ -338,5 +338,6 @@ def test_a_run_is_written_as_an_octree() -> None:
     torch.testing.assert_close(drawn, colors(model, rays), atol=0.03, rtol=0)
     small = bake(loaded, Baking(max_bytes=2000))
     assert 100 < small.layout.num_leaves < 200
+    assert f"0.002 MB hold {small.layout.num_leaves} of 512 leaves" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="--degree is 2"):
         bake(loaded, Baking(degree=2))

@@ -21,6 +21,7 @@ from nerfloom.kernels.octree.trace import trace_octree
 from nerfloom.losses.functions import mean_squared_error
 from nerfloom.model import Loss, Model
 from nerfloom.octrees.drawn import RAYS_AT_ONCE, DrawsOctree
+from nerfloom.octrees.growth import UNMET
 
 STOP = 1e-2
 """Transmittance below which rays end in training."""
@@ -91,7 +92,8 @@ class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
     cells: Tensor
     """(L, 3) int32 coordinates of the leaves, in cells and in the layout's order."""
     peaks: Tensor | None
-    """(L,) largest weight of each leaf on training rays, since leaves were set; None if nothing needs it."""
+    """(L,) largest weight of each leaf on training rays since leaves were set, `UNMET` for none; None if nothing needs
+    it."""
 
     def __init__(self, config: OctreeConfigT, scene: Scene) -> None:
         super().__init__(config, scene)
@@ -134,7 +136,7 @@ class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
         self.bricks = torch.tensor(layout.size, device=layout.origin.device)
         self.cells = layout.cells().int()
         if self.peaks is not None:
-            self.peaks = self.frame.new_zeros(layout.num_leaves)
+            self.peaks = self.frame.new_full((layout.num_leaves,), UNMET)
 
     def find_leaves(self) -> None:
         """Construct the layout from the buffers, after these were loaded.

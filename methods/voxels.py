@@ -51,8 +51,8 @@ COLOR_VARIATION = 0.1
 RAYS_PER_LOOK = 8
 """One training ray out of this number is followed to its end. It also meets leaves behind others, which are then known
 to be hidden."""
-NOT_LEARNT = ("depth_loss_mult", "free_space_loss_mult", "thin_gradients", "gradient_scaling")
-"""Settings of methods with samples along rays, which have no meaning here."""
+UNUSED = ("appearance", "depth_loss_mult", "free_space_loss_mult", "thin_gradients", "gradient_scaling")
+"""Settings of other methods that cast rays, which have no meaning here."""
 
 
 @dataclass(frozen=True)
@@ -142,10 +142,10 @@ class Voxels(OctreeModel[VoxelsConfig]):
         super().__init__(config, scene)
         if scene.warped:
             raise ConfigError("voxels cannot learn normalised device coordinates: leave out --ndc, or take nerfacto")
-        for name in NOT_LEARNT:
-            if value := getattr(config, name):
+        for name in UNUSED:
+            if (value := getattr(config, name)) != getattr(METHOD.config, name):
                 flag = name.replace("_", "-")
-                raise ConfigError(f"--{flag} is {value}, and voxels learn from colours alone: leave it out")
+                raise ConfigError(f"--{flag} is {value}, and voxels learns one light from colours alone: leave it out")
         first = first_cells(config.resolution, config.num_splits)
         if first**3 > config.max_leaves:
             raise ConfigError(

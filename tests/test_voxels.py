@@ -324,6 +324,7 @@ def test_cells_follow_the_images_and_the_time() -> None:
         ({"unbounded": True}, {}, "extends beyond its box: take a method for captures"),
         ({"warped": True}, {}, "leave out --ndc"),
         ({}, {"depth_loss_mult": 0.1}, "--depth-loss-mult is 0.1"),
+        ({}, {"appearance": "affine"}, "--appearance is affine"),
         ({}, {"resolution": 2048, "num_splits": 1}, "raise --num-splits"),
     ],
 )

@@ -76,7 +76,7 @@ class WebSettings:
 
     kind: PageKind | None = None
     """What the page shows. octree: a run is baked, as by ns-bake; gaussians: they are fitted to what has none. Default:
-    the octree of an octree's file, else Gaussians."""
+    the octree of an octree's file or of a run of voxels, else Gaussians."""
     max_megabytes: float = 30.0
     """Maximum size of the page, MB (1e6 bytes), up to 32. Harmonics are reduced first, Gaussians or leaves last."""
     fit_seconds: float = 60.0

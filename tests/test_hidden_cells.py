@@ -65,9 +65,8 @@ def test_only_space_within_the_frames_of_enough_images_is_hidden(few: HiddenCell
     assert bool(hidden[(z < 0.5) & (aside < 0.7)].all())
     assert not bool(hidden[(z > 1.1) | (aside > 0.8)].any())
     few.shown.zero_()
-    few.show(
-        cameras, torch.tensor([0.1, 100.0]), 2, EVERYWHERE
-    )  # the second shows everything nearer than 100 to be empty
+    nearest[1] = 100.0  # the second shows everything nearer than 100 to be empty
+    few.show(cameras, nearest, 2, EVERYWHERE)
     few.settle(PERIOD)
     assert not few.at(middles()).any()
 

@@ -110,7 +110,7 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
     unclear = torch.full_like(first, -torch.inf)
     paths = _Paths(active, first, first, was, was * torch.inf, first, unclear, first, first, first)
     span = 2 * (float(pieces.ends.max()) + shortest) if len(active) else 1.0  # one number orders ray and distance
-    ends = pieces.owners * span + pieces.ends.double()
+    ends = pieces.owners.double() * span + pieces.ends
     met, evaluations = [(paths.of(active < 0), first[:0])], 0
     while len(paths.rays):
         value = distance(rays.points(paths.rays, paths.t))
@@ -121,7 +121,7 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
         # At least a few units in the last place, so that a ray far away ends too.
         step = value.abs().clamp(min=shortest).maximum(radius / 2).maximum(4 * torch.finfo(value.dtype).eps * paths.t)
         to = paths.t + step
-        piece = torch.searchsorted(ends, paths.rays * span + to.double(), right=True)
+        piece = torch.searchsorted(ends, paths.rays.double() * span + to, right=True)
         over = piece >= pieces.offsets[paths.rays + 1]
         start = pieces.starts[piece.clamp(max=len(ends) - 1)]
         gap = ~over & (start > to + shortest)

@@ -1,9 +1,7 @@
 """The nerfstudio format: rays go where the file's cameras look, and what makes no sense is refused in one line."""
 
 import dataclasses
-import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from tests.dataparsers.captures import (
     HEIGHT,
     POINTS,
     WIDTH,
+    edit,
     miss,
     poses,
     to_scene,
@@ -36,12 +35,6 @@ from tests.exr_files import write_exr
 EXACT = 2e-6
 """What float32 leaves of a ray's direction."""
 ALL = Nerfstudio(eval_mode="all")
-
-
-def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    content = json.loads((folder / "transforms.json").read_text())
-    change(content)
-    (folder / "transforms.json").write_text(json.dumps(content))
 
 
 @pytest.fixture

@@ -35,6 +35,7 @@ from nerfloom.processing.finite_numbers import UNUSABLE, bounded, finite_array
 from nerfloom.processing.listing import find_images
 from nerfloom.processing.phone import evenly_spaced
 from nerfloom.processing.point_files import GREY, MAX_POINTS
+from nerfloom.processing.record3d import rotations
 from nerfloom.processing.transforms import Lens
 
 PROGRAM = "Aria"
@@ -307,11 +308,4 @@ def _rotation(quaternion: np.ndarray, what: str) -> np.ndarray:
     length = float(np.linalg.norm(quaternion))
     if not 0.5 < length < 2:
         raise DataError(f"{what} has a quaternion that is not of unit length")
-    x, y, z, w = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotations(quaternion[None] / length)[0]

@@ -22,10 +22,10 @@ demo: .venv/installed
 	echo "turntable:" && ls $$run/orbit.gif
 
 test: .venv/installed-test
-	$(BIN)/python -m pytest -n auto -m "not slow"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow"
 
 test-fast: .venv/installed-test
-	$(BIN)/python -m pytest -n auto -m "not slow and not medium"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not medium"
 
 test-all: .venv/installed-test .venv/installed-docs
 	$(BIN)/python -m pytest

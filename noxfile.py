@@ -20,7 +20,7 @@ import nox
 
 ROOT = Path(__file__).parent
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
-FAST = ("-n", "auto", "-m", "not slow")
+FAST = ("-n", "auto", "--dist", "worksteal", "-m", "not slow")
 TORCHLESS = (
     *("tests/downloads/test_fetch.py", "tests/downloads/test_unpack.py", "tests/processing/test_images.py"),
     *("tests/processing/test_retrieval.py", "tests/processing/test_video_frames.py", "tests/release/test_release.py"),

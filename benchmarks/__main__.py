@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.flags import (
-    AblationFlags,
     CacheFlags,
     CityFlags,
     ContentionFlags,
@@ -20,7 +19,6 @@ from benchmarks.flags import (
     PosesFlags,
     ProcessesFlags,
     QuadratureFlags,
-    StartsFlags,
     TablesFlags,
     ViewerBenchFlags,
 )
@@ -37,8 +35,6 @@ usage: python -m benchmarks WHAT [flags]
   quadrature       error of every sampler against field evaluations per ray, on scenes with a known integral
   curves           PSNR against seconds of every method: a run for each of several budgets and seeds, in one picture
   tables           rows of published tables, each a run judged on every held-out image; goes on where it was stopped
-  ablation         effect of each part of instant-ngp: training with one part switched off, or on, in turn
-  starts           where Gaussians start: time to a PSNR from points, a field's surfaces, silhouettes, or anywhere
   processes        time to each PSNR with one process and with several, started by torchrun, on the same cores
   operations       operations of torch and waits for the device in a training step without compiled kernels
   contention       speed of training and rendering beside other programs
@@ -138,22 +134,6 @@ def _tables(flags: TablesFlags) -> None:
         raise ConfigError(f"{len(failures)} rows failed, first {next(iter(failures))}: {next(iter(failures.values()))}")
 
 
-def _ablation(flags: AblationFlags) -> None:
-    from benchmarks.ablation import measure
-
-    path = flags.output_dir / f"ablation-{flags.data.resolve().name}.json"
-    make_room(path)
-    write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
-
-
-def _starts(flags: StartsFlags) -> None:
-    from benchmarks.starts import measure
-
-    path = flags.output_dir / f"starts-{flags.data.resolve().name}.json"
-    make_room(path)
-    write_results(path, measure(flags.data, flags.seconds, flags.seeds, flags.target))
-
-
 def _processes(flags: ProcessesFlags) -> None:
     """Measure, and write the results.
 
@@ -251,8 +231,6 @@ KINDS: dict[str, tuple[type, Any]] = {
     "quadrature": (QuadratureFlags, _quadrature),
     "curves": (CurvesFlags, _curves),
     "tables": (TablesFlags, _tables),
-    "ablation": (AblationFlags, _ablation),
-    "starts": (StartsFlags, _starts),
     "processes": (ProcessesFlags, _processes),
     "operations": (OperationsFlags, _operations),
     "contention": (ContentionFlags, _contention),

@@ -19,8 +19,6 @@ METHOD = "nerfacto"
 """Method of the blocks with the results used."""
 RENDERED = 200 * 200
 """Number of pixels of the pictures in methods-procedural.json."""
-COMMAND_LIMIT = 2**21
-"""Largest command of Linux, bytes: a quarter of a stack of 8 MiB."""
 
 
 @dataclass(frozen=True)
@@ -60,11 +58,11 @@ class Constants(NamedTuple):
     kept: int
     """Maximum number of blocks in memory."""
     small: int
-    """Longer side of the small pictures of training images, pixels."""
+    """Minimum length of the longer side of the small pictures of training images, pixels."""
     looked: int
     """Number of training images that a visibility network learns from."""
     matched: int
-    """Maximum number of images used to match two blocks."""
+    """Maximum number of shared images that match the colours of two blocks."""
     coarse: int
     """Shorter side of the picture with rays for visibility, pixels."""
     shares: int
@@ -124,8 +122,8 @@ def measured(results: Path) -> Measured:
     """Return the measured values in a folder of results.
 
     Args:
-        results: folder with methods-procedural.json (`ns-bench methods`) and city.json, either may be missing.
-            city.json may have values by the names of `Measured`, which take precedence.
+        results: folder with methods-procedural.json (`ns-bench methods`) and city.json. Each file may be missing.
+            Values in city.json have the names of `Measured` and take precedence.
     """
     runs = _read(results / "methods-procedural.json").get("runs", [])
     own: dict[str, Any] = next((run for run in runs if run["method"] == METHOD), {})
@@ -153,7 +151,7 @@ def rows(c: City, k: Constants, m: Measured) -> list[Row]:
     own, picture, digits = c.images / c.blocks * times, c.width * c.height, len(str(c.images - 1))
     small = _kept(c, max(c.width, c.height) // k.small)
     coarse = _kept(c, min(c.width, c.height) // k.coarse)
-    word, gaussians = digits + 1 + 8, c.blocks * c.gaussians  # digits, a zero byte, and a pointer
+    gaussians = c.blocks * c.gaussians
     return [
         Row("images of a block", "m = M / B / (1 - o)^2", _count(own)),
         Row("blocks of an image", "1 / (1 - o)^2", _count(times)),
@@ -164,9 +162,7 @@ def rows(c: City, k: Constants, m: Measured) -> list[Row]:
         Row("machine time of training", "B S", _time(c.blocks * c.seconds)),
         Row("rays of a block's training", "r S", _count(m.rays * c.seconds)),
         Row("time for one ray through each pixel of a block", "m w h / r", _time(own * picture / m.rays)),
-        Row("command of a job", f"{word} m", _size(own * word)),
-        Row("images of a block that a command can name", f"2 MiB / {word}", _count(COMMAND_LIMIT // word)),
-        Row("messages to workers", f"B of {digits + 1} m", f"{c.blocks:,} of {_size(own * (digits + 1))}"),
+        Row("`recipe.json` of a block", f"{digits + 6} m", _size(own * (digits + 6))),
         Row("`plan.json`", f"{digits + 8} m B", _size(own * c.blocks * (digits + 8))),
         Row("`blocks.yml`", f"{digits + 2} m B", _size(own * c.blocks * (digits + 2))),
         Row("two checkpoints of a block", "24 P", _size(24 * m.parameters)),

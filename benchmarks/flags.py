@@ -51,32 +51,6 @@ class CurvesFlags:
     """Folder of the picture, curves-DATA.svg."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class AblationFlags:
-    """Train instant-ngp with one part switched off, or on, in turn; report the time to a PSNR and the final PSNR."""
-
-    data: Path
-    """Folder of the data set."""
-    seconds: float = 45.0
-    """Seconds of training of each run."""
-    seeds: int = 2
-    """Number of runs of each variant."""
-    target: float = 30.0
-    """The time to reach this PSNR of the validation views is reported, dB."""
-    output_dir: Path = RESULTS
-    """Folder of the results: ablation-DATA.json or starts-DATA.json."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class StartsFlags(AblationFlags):
-    """Train gaussian-splatting from each kind of start in turn; report the time to a PSNR and the final PSNR."""
-
-    seconds: float = 60.0
-    """Seconds of training of each run."""
-    seeds: int = 1
-    """Number of runs from each start."""
-
-
 @dataclass(frozen=True)
 class OperationsFlags:
     """Count operations of torch, and waits for the device, in a training step on torch alone, as on a GPU."""

@@ -9,14 +9,17 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from benchmarks.ablation import VIEWS, crossing
 from benchmarks.children import output_of
 from nerfloom.base.child import python_command
 from nerfloom.base.console import say
 from nerfloom.training.machine import machine
+
+VIEWS = 4
+"""Number of validation views of the learning curve."""
 
 
 def measure(
@@ -85,3 +88,14 @@ def trained(
             "PSNR of test views, dB": final,
             "curve": curve,
         }
+
+
+def crossing(curve: Sequence[tuple[float, float]], target: float) -> float | None:
+    """Return the time when a `curve` of (seconds, PSNR) first reaches a `target`, seconds; None if it does not.
+
+    Between its points the curve is linear.
+    """
+    for (t0, p0), (t1, p1) in pairwise(curve):
+        if p1 >= target > p0:
+            return t0 + (t1 - t0) * (target - p0) / (p1 - p0)
+    return None

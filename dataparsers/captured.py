@@ -98,6 +98,7 @@ def captured_scene(
         sightings=None if sparse.sightings is None else sparse.sightings.of_images(chosen),
         unbounded=True,
         poses=flags.poses,
+        z_is_up=flags.orientation_method in ("auto", "up"),
         depth_paths=images.depths,
         object_distances=_object_distances(flags, cameras, box) if shows_object else None,
         taken=images.taken,
@@ -231,11 +232,14 @@ def _box(flags: Captured, region: StatedRegion | None, placement: Placement) -> 
 
 
 def _object_distances(flags: Captured, cameras: Cameras, box: Tensor) -> tuple[float, float]:
-    """Return near and far for an object in `box`, within the near and far flags."""
-    near, far = distances(cameras, box.double())
-    near, far = max(near, flags.near or 0.0), min(far, flags.far)
+    """Return near and far for an object in `box`, within those of the flags."""
+    first, last = distances(cameras, box.double())
+    near, far = max(first, flags.near or 0.0), min(last, flags.far)
     if near >= far:
-        raise DataError(f"--near {flags.near} and --far {flags.far} leave nothing of the object, from {near} to {far}")
+        raise DataError(
+            f"--near {flags.near} and --far {flags.far} leave nothing of the object, which is {first:.4g} to "
+            f"{last:.4g} scene units from the cameras; leave them out, or choose others"
+        )
     return near, far
 
 
@@ -255,7 +259,7 @@ def checked_box(box: Tensor, source: str) -> Tensor:
         DataError: if the box is empty or too large.
     """
     if not bool((box.abs() < MAX_MAGNITUDE).all()) or not bool((box[0] < box[1]).all()):
-        raise DataError(f"{source} give a box that is empty or too large")
+        raise DataError(f"{source} give a box that is empty or too large; change them")
     return box
 
 
@@ -310,4 +314,7 @@ def _check_range(images: PosedImages, intrinsics: Tensor) -> None:
     if not bool(usable.all()):
         first = int(usable.int().argmin())
         values = ", ".join(f"{value:.3g}" for value in intrinsics[first].tolist())
-        raise DataError(f"{images.paths[first]}: its camera has fx, fy, cx, cy = {values} pixels: out of range")
+        raise DataError(
+            f"{images.paths[first]}: its camera has fx, fy, cx, cy = {values} pixels: out of range; correct them, or "
+            "remove the image from the data"
+        )

@@ -158,7 +158,10 @@ def read_model(folder: Path) -> SparseModel:
             f"{folder} cannot be read: its files are damaged or inconsistent ({one_line(error)})"
         ) from error
     if not images:
-        raise DataError(f"{folder} has no image with a pose; COLMAP registered none")
+        raise DataError(
+            f"{folder} has no image with a pose, as COLMAP registered none; take more photographs that overlap, or "
+            "name another model: --colmap-path FOLDER"
+        )
     for name, pose in zip(names, poses, strict=True):
         _check(name, pose, folder)
     if left_out := len(model.points3D) - len(points):

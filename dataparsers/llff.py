@@ -182,4 +182,7 @@ def _image_names(root: Path) -> list[str]:
         names = sorted(file.name for file in folder.glob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
         if names:
             return names
-    raise DataError(f"{root.parent} has no images in {', '.join(folder.name for folder in folders)}")
+    listed = ", ".join(folder.name for folder in folders)
+    raise DataError(
+        f"{root.parent} has no images in {listed}; put them there, or name their folder: --images-path FOLDER"
+    )

@@ -16,6 +16,7 @@ from nerfloom.base.errors import shown
 from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
+from nerfloom.cameras.poses import Orientation
 from nerfloom.data.depths import DEPTH_SUFFIXES
 from nerfloom.data.exposure import Taken
 from nerfloom.data.names_on_disk import nearest_on_disk, on_disk, spelled
@@ -72,20 +73,20 @@ class Nerfstudio(Captured):
         if split == "train" and self.depth_unit_scale_factor == MILLIMETRE and _has_exr(images.depths):
             say("depths in EXR files are read as millimetres; use --depth-unit-scale-factor 1 if they are in metres")
         lists = {} if self.eval_mode == "all" else _lists(file, content, images.names)
-        scene = captured_scene(
-            self._oriented(content), images, split, self._division(split, lists), _applied(content, file)
-        )
-        scene = replace(scene, depth_unit=self.depth_unit_scale_factor)
+        stated = self._stated_orientation(content)
+        flags = self if stated is None else replace(self, orientation_method=stated)
+        scene = captured_scene(flags, images, split, self._division(split, lists), _applied(content, file))
+        z_is_up = scene.z_is_up or stated is not None
+        scene = replace(scene, depth_unit=self.depth_unit_scale_factor, z_is_up=z_is_up)
         return _from_original(_with_cube(scene, content, file, self.scene_scale), content, file)
 
-    def _oriented(self, content: dict[str, Any]) -> Nerfstudio:
-        """Return the flags with the up direction that the file states, if it is left to the data.
+    def _stated_orientation(self, content: dict[str, Any]) -> Orientation | None:
+        """Return the up direction that the file states, if it is left to the data; else None.
 
         Devices and other programs know which way is up, also where cameras look straight down.
         """
         stated: Any = content.get("orientation_override")
-        known = self.orientation_method == "auto" and stated in STATED_ORIENTATIONS
-        return replace(self, orientation_method=stated) if known else self
+        return stated if self.orientation_method == "auto" and stated in STATED_ORIENTATIONS else None
 
     def _division(self, split: Split, lists: dict[str, set[str]]) -> Division | None:
         if lists:
@@ -237,7 +238,10 @@ def _from_original(scene: ParsedScene, content: dict[str, Any], file: Path) -> P
     """
     scene = from_original(scene, *_applied(content, file))
     if scene.transform is None or not bool(scene.transform.isfinite().all()) or not 0 < scene.scale < math.inf:
-        raise DataError(f"{file}: 'applied_transform' and 'applied_scale' give a transform out of range")
+        raise DataError(
+            f"{file}: 'applied_transform' and 'applied_scale' give a transform out of range; correct them, "
+            "or remove both"
+        )
     return scene
 
 

@@ -53,7 +53,10 @@ class Phototourism(Captured):
         images = read_images(path, model, self.images_path, self.masks_path, split)
         listed = [index for index, name in enumerate(images.names) if spelled(name) in splits]
         if not listed:
-            raise DataError(f"{tables[0]} lists none of the {len(images.names)} images of {model}")
+            raise DataError(
+                f"{tables[0]} lists none of the {len(images.names)} images of {model}; it must have their names, such "
+                f"as {images.names[0]}"
+            )
         group = "train" if split == "train" else "test"
 
         def division(names: list[str]) -> Tensor:

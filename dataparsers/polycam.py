@@ -56,7 +56,7 @@ def _is_pair(path: Path, cameras: str, images: str) -> bool:
 def _posed_images(folder: Path, cameras: str, images: str, split: Split) -> PosedImages:
     files = sorted((folder / cameras).glob("*.json"))
     if not files:
-        raise DataError(f"{folder / cameras} has no cameras (.json)")
+        raise DataError(f"{folder / cameras} has no cameras (.json); export Polycam's raw data again")
     stems = [file.stem for file in files]
     paths = on_disk(folder, [f"{images}/{stem}" for stem in stems], quiet=split != "train")
     poses, intrinsics, stated = [], [], []

@@ -51,12 +51,13 @@ def factored(matrices: Tensor, labels: Sequence[str]) -> Projections:
     """
     for matrix, label in zip(matrices, labels, strict=True):
         if not bool(matrix.isfinite().all()):
-            raise DataError(f"{label} has entries that are not finite")
+            raise DataError(f"{label} has entries that are not finite; correct the matrix")
     lengths = matrices[:, :, :3].norm(dim=-1, keepdim=True)
     rows = matrices / lengths.clamp(min=torch.finfo(torch.float64).tiny)
     volumes = torch.linalg.det(rows[:, :, :3])
     if bool((~(volumes.abs() > SINGULAR)).any()):
-        raise DataError(f"{labels[int(volumes.abs().argmin())]} is singular, so it is not a camera's projection")
+        worst = labels[int(volumes.abs().argmin())]
+        raise DataError(f"{worst} is singular, so it is not a camera's projection; correct the matrix")
     matrices = matrices * (volumes.sign()[:, None, None] / lengths[:, 2:])
     # With J, which reverses rows: (J M)^T = Q U, so M = (J U^T J) (J Q^T), upper triangular times orthonormal.
     left, upper = torch.linalg.qr(matrices[:, :, :3].flip(1).mT)

@@ -29,7 +29,7 @@ def read_frames(content: dict[str, Any], file: Path, image: str) -> tuple[list[d
     """
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise DataError(f"{file} lists no frames")
+        raise DataError(f"{file} lists no frames; 'frames' must be a list of images and their poses")
     labels = [f"{file}: frame {index}" for index in range(len(frames))]
     for frame, label in zip(frames, labels, strict=True):
         if not isinstance(frame, dict):

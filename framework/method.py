@@ -117,7 +117,7 @@ class Method:
 
         Raises:
             ConfigError: if the settings do not fit the scene or each other, if the model does not fit into memory, or
-                if the method cannot learn such data: several scenes, or a scene without an end.
+                if the method cannot learn such data: several scenes, a scene without an end, or light that differs.
         """
         if scene.num_scenes > 1 and not issubclass(self.model, RendersFromImages):
             raise ConfigError(
@@ -130,13 +130,18 @@ class Method:
                 "captures, such as gaussian-splatting or nerfacto"
             )
         try:
-            return self._built(config, scene)
+            model = self._built(config, scene)
         except (MemoryError, RuntimeError) as error:
             if not is_out_of_memory(error):
                 raise
             raise ConfigError(
                 f"the model of {self.name} does not fit into memory with these settings; make it smaller"
             ) from error
+        if model.appearance is None and model.config.appearance != "none":
+            raise ConfigError(
+                f"--appearance is {model.config.appearance}, and {self.name} learns one light for all images: take none"
+            )
+        return model
 
     def _built(self, config: TrainConfig, scene: Scene) -> Model[Any]:
         config, _ = self.decided(config, scene)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar, runtime_c
 import torch
 from torch import Tensor, nn
 
-from nerfloom.base.config import TrainConfig
+from nerfloom.base.config import RayConfig, TrainConfig
 from nerfloom.base.device import has_bfloat16
 from nerfloom.base.optimised import ParameterGroup, RowChange, parameter_groups
 from nerfloom.base.pace import Pace
@@ -21,9 +21,10 @@ from nerfloom.data.scene import Scene
 from nerfloom.fields.appearance import Appearance
 from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.kernels.table_memory import IN_MEMORY, Tables
-from nerfloom.renderable import Renderable, parts
+from nerfloom.renderable import Renderable, RendersRays, parts
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
+RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
 
     @property
     def appearance(self) -> Appearance | None:
-        """Appearance of the training images, of whichever part has one; None if all images have the same."""
+        """Appearance of the training images, of the part that has one; None if all images have the same."""
         return next(iter(parts(self, Appearance)), None)
 
     @property
@@ -158,6 +159,22 @@ class Model(nn.Module, Renderable, Generic[ConfigT]):
     def size(self) -> int:
         """Return the number of trainable parameters."""
         return sum(parameter.numel() for parameter in self.parameters())
+
+
+class PixelModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
+    """Base class of models that learn from single pixels, by their rays."""
+
+    batches: ClassVar[Literal["pixels", "views"]] = "pixels"
+
+    @property
+    def rays_at_once(self) -> int:
+        """Maximum number of rays to render at once, as configured."""
+        return self.config.eval_num_rays_per_chunk
+
+    @property
+    def rays_per_pixel(self) -> int:
+        """Number of rays averaged per pixel, as configured."""
+        return self.config.rays_per_pixel
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -19,8 +19,9 @@ from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import MAX_DEGREE, OctreeLight, depths_of, error_bound
 from nerfloom.kernels.octree.trace import trace_octree
 from nerfloom.losses.functions import mean_squared_error
-from nerfloom.model import Loss, Model
+from nerfloom.model import Loss, PixelModel
 from nerfloom.octrees.drawn import RAYS_AT_ONCE, DrawsOctree
+from nerfloom.octrees.growth import UNMET
 
 STOP = 1e-2
 """Rays end below this transmittance in training."""
@@ -75,7 +76,7 @@ class LeafTable(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
-class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
+class OctreeModel(PixelModel[OctreeConfigT], DrawsOctree):
     """An octree with learnt density and colour; `set_octree` sets the positions of its leaves.
 
     Args:
@@ -83,7 +84,6 @@ class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
         scene: the scene.
     """
 
-    batches: ClassVar[Literal["pixels", "views"]] = "pixels"
     frame: Tensor
     """(4,) corner of the first cell, and a cell's edge, scene units."""
     bricks: Tensor
@@ -91,7 +91,8 @@ class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
     cells: Tensor
     """(L, 3) int32 coordinates of the leaves, in cells and in the layout's order."""
     peaks: Tensor | None
-    """(L,) largest weight of each leaf on training rays, since leaves were set; None if nothing needs it."""
+    """(L,) largest weight of each leaf on training rays since leaves were set, `UNMET` for none; None if nothing needs
+    it."""
 
     def __init__(self, config: OctreeConfigT, scene: Scene) -> None:
         super().__init__(config, scene)
@@ -134,7 +135,7 @@ class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
         self.bricks = torch.tensor(layout.size, device=layout.origin.device)
         self.cells = layout.cells().int()
         if self.peaks is not None:
-            self.peaks = self.frame.new_zeros(layout.num_leaves)
+            self.peaks = self.frame.new_full((layout.num_leaves,), UNMET)
 
     def find_leaves(self) -> None:
         """Construct the layout from the buffers, after these were loaded.
@@ -191,16 +192,6 @@ class OctreeModel(Model[OctreeConfigT], DrawsOctree, Generic[OctreeConfigT]):
     def samples_per_step(self) -> int | None:
         """Number of leaves that the rays of a training step meet, as configured; None for a fixed number of rays."""
         return self.config.samples_per_batch
-
-    @property
-    def rays_at_once(self) -> int:
-        """Maximum number of rays to render at once, as configured."""
-        return self.config.eval_num_rays_per_chunk
-
-    @property
-    def rays_per_pixel(self) -> int:
-        """Number of rays averaged per pixel, as configured."""
-        return self.config.rays_per_pixel
 
     @property
     def uses_bfloat16(self) -> bool:

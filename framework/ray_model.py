@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from nerfloom.base.config import RayConfig
 from nerfloom.base.step_kind import StepKind
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.cameras.view import View
@@ -22,8 +21,8 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.traced.squared_error import PixelTargets, TracedError
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
-from nerfloom.model import Loss, Model
-from nerfloom.renderable import RendersRays, parts
+from nerfloom.model import Loss, PixelModel, RayConfigT
+from nerfloom.renderable import parts
 from nerfloom.rendering.light import SQUARED, make_light
 from nerfloom.rendering.outputs import Output, empty
 from nerfloom.rendering.rendered import Picture, Rendered
@@ -34,13 +33,10 @@ from nerfloom.samplers.base import Sampler, SkipsCells
 from nerfloom.samplers.in_view import pixels_in_view
 from nerfloom.scene.covisible_space import CovisibleSpace
 
-RayConfigT = TypeVar("RayConfigT", bound=RayConfig)
 
-
-class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
+class RayModel(PixelModel[RayConfigT]):
     """A model that evaluates a field at a sampler's positions and composites the values with a renderer."""
 
-    batches: ClassVar[Literal["pixels", "views"]] = "pixels"
     losses: ClassVar[Sequence[LossTerm]] = (COLOR_ERROR, CoarseColorError(), SamplerLoss(), *KNOWN_DISTANCES)
     """The objective: the sum of the terms that apply to the settings and the batch."""
     steps_repeat: ClassVar[bool] = False
@@ -217,13 +213,3 @@ class RayModel(Model[RayConfigT], RendersRays, Generic[RayConfigT]):
     def samples_per_step(self) -> int | None:
         """Number of samples per training step, set by the sampler; None for a fixed number of pixels."""
         return self.sampler.samples_per_step
-
-    @property
-    def rays_at_once(self) -> int:
-        """Maximum number of rays to render at once, as configured."""
-        return self.config.eval_num_rays_per_chunk
-
-    @property
-    def rays_per_pixel(self) -> int:
-        """Number of rays averaged per pixel, as configured."""
-        return self.config.rays_per_pixel

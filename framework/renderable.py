@@ -78,6 +78,11 @@ class Renderable(ABC):
         return ()
 
     @property
+    def appearance(self) -> Appearance | None:
+        """Appearance of the training images; None if all images have the same."""
+        return None
+
+    @property
     def rays_per_pixel(self) -> int:
         """Number of rays averaged per pixel, if the view does not set it."""
         return 1
@@ -127,14 +132,6 @@ class RendersFromImages(Protocol):
             dataset: images on the model's device. Without `source_images` they are the training images, and each may be
                 rendered from the others. Otherwise they are further scenes, rendered from their source images.
         """
-
-
-@runtime_checkable
-class HasAppearance(Protocol, metaclass=SeesRegistered):
-    """A model that can learn an appearance vector for each image."""
-
-    appearance: Appearance | None
-    """The vectors; None if the settings or the scene do not use them."""
 
 
 @runtime_checkable

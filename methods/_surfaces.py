@@ -331,8 +331,9 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         Args:
             dataset: the training images.
         """
-        if self.hidden is not None:
-            self.hidden.show(dataset.cameras, nearest_shown(dataset), max(self.config.rays_shared_by, 1))
+        if self.hidden is not None and self.sphere is not None:
+            least = max(self.config.rays_shared_by, 1)
+            self.hidden.show(dataset.cameras, nearest_shown(dataset), least, self.sphere)
         distance = self.surface.distance
         if self.sphere is None or dataset.points is None or not isinstance(distance, GridDistance):
             return

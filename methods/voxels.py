@@ -2,7 +2,7 @@
 
 Fridovich-Keil et al., "Plenoxels: Radiance Fields without Neural Networks", CVPR 2022, and Sun et al., "Sparse Voxels
 Rasterization: Real-time High-fidelity Radiance Field Rendering", CVPR 2025. There is no network: each leaf of an octree
-has a density and harmonics of its colour. Training starts with few large leaves. Leaves that no ray sees are dropped,
+has a density and harmonics of its colour. Training starts with few large leaves. Leaves that hardly show are dropped,
 and the others are split.
 """
 
@@ -16,7 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from nerfloom import ConfigError, Dataset, Decision, Loss, Method, PixelBatch, RowChange, Scene
+from nerfloom import ConfigError, Dataset, Decision, Loss, Method, PixelBatch, Rays, RowChange, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.console import say
 from nerfloom.base.decisions import Choice, fill
@@ -26,9 +26,10 @@ from nerfloom.kernels.adam.row_gradient import table_rows
 from nerfloom.kernels.encodings.spherical_harmonics import CONSTANT
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import depths_of, raw_of
+from nerfloom.kernels.octree.weights import raise_weights
 from nerfloom.losses.leaf_variation import leaf_variation
 from nerfloom.octree_model import OctreeConfig, OctreeModel
-from nerfloom.octrees.growth import moments, split, visible
+from nerfloom.octrees.growth import UNMET, moments, split, visible
 from nerfloom.octrees.hull import Hull
 
 MAX_RESOLUTION = 2048
@@ -46,9 +47,12 @@ FOG = 1.0
 VARIED_BRICKS, STEPS_PER_VARIATION = 32, 4
 """Number of bricks with total variation in the loss, and number of steps from one such step to the next."""
 COLOR_VARIATION = 0.1
-"""Weight of the total variation of colours, relative to the weight for opacities."""
-NOT_LEARNT = ("depth_loss_mult", "free_space_loss_mult", "thin_gradients", "gradient_scaling")
-"""Settings of methods with samples along rays, which have no meaning here."""
+"""Weight of the total variation of colours, relative to that of opacities."""
+RAYS_PER_LOOK = 8
+"""One training ray out of this number is followed to its end. It also meets leaves behind others, which are then known
+to be hidden."""
+UNUSED = ("depth_loss_mult", "free_space_loss_mult", "thin_gradients", "gradient_scaling")
+"""Settings of other methods that cast rays, which have no meaning here."""
 
 
 @dataclass(frozen=True)
@@ -138,10 +142,10 @@ class Voxels(OctreeModel[VoxelsConfig]):
         super().__init__(config, scene)
         if scene.warped:
             raise ConfigError("voxels cannot learn normalised device coordinates: leave out --ndc, or take nerfacto")
-        for name in NOT_LEARNT:
-            if value := getattr(config, name):
+        for name in UNUSED:
+            if (value := getattr(config, name)) != getattr(METHOD.config, name):
                 flag = name.replace("_", "-")
-                raise ConfigError(f"--{flag} is {value}, and voxels learn from colours alone: leave it out")
+                raise ConfigError(f"--{flag} is {value}, and voxels learns from colours alone: leave it out")
         first = first_cells(config.resolution, config.num_splits)
         if first**3 > config.max_leaves:
             raise ConfigError(
@@ -179,9 +183,16 @@ class Voxels(OctreeModel[VoxelsConfig]):
             step: number of training steps done.
         """
         loss = super().loss(batch, step)
+        if self.training:
+            self._look(batch.rays[::RAYS_PER_LOOK])
         if not self.config.total_variation or step % STEPS_PER_VARIATION:
             return loss
         return replace(loss, terms=loss.terms | {"variation": self.config.total_variation * self._variation()})
+
+    def _look(self, rays: Rays) -> None:
+        """Raise the largest weights of the leaves that some rays meet, also behind where training ends a ray."""
+        assert self.peaks is not None
+        raise_weights(self.layout, self.densities.table.detach(), rays, self.peaks)
 
     def _variation(self) -> Tensor:
         """Return the total variation () of the leaves of some bricks in a row."""
@@ -205,21 +216,25 @@ class Voxels(OctreeModel[VoxelsConfig]):
         splits, most = self._moments[done][1], self.config.max_leaves
         self.changes += 1
         # Sums over processes are at least the maxima. Thresholds rise, as coarse fog has small weights everywhere.
-        peaks, least = add_up(self.peaks), self.config.prune_weight * (done + 1) / len(self._moments)
+        met, sums = add_up((self.peaks >= 0).float()) > 0, add_up(self.peaks.clamp(min=0))
+        peaks, least = torch.where(met, sums, UNMET), self.config.prune_weight * (done + 1) / len(self._moments)
         kept = visible(peaks, least, most // 8 if splits else most)
         if (dropped := int((peaks >= least).sum()) - len(kept)) > 0:
             say(f"note: {dropped:,} visible leaves are dropped, since --max-leaves is {most:,}")
         cells, tables = self.cells[kept].long(), (self.densities.table, self.colors.table)
-        if not splits:
-            finer, rows = OctreeLayout.build(layout.origin, layout.cell, layout.size, cells)
-            self.set_layout(finer)
-            return [RowChange(table, kept[rows]) for table in tables]
-        finer, wholes = split(layout, cells)
-        rows, none = kept[wholes], kept[:0]
-        # An edge is half as long, so half as deep. Rows are new for Adam: gradients of smaller leaves are smaller.
-        raw, coefficients = raw_of(self.depths(rows) / 2)[:, None], self.coefficients()[rows]
+        if splits:
+            finer, chosen = split(layout, cells)
+        else:
+            finer, chosen = OctreeLayout.build(layout.origin, layout.cell, layout.size, cells)
+        rows = kept[chosen]
         self.set_layout(finer)
-        return [RowChange(table, none, fresh) for table, fresh in zip(tables, (raw, coefficients), strict=True)]
+        # Leaves that no ray has met stay once: if none meets them before the next change either, no image shows them.
+        self.peaks[peaks[rows] < 0] = 0
+        if not splits:
+            return [RowChange(table, rows) for table in tables]
+        # An edge is half as long, so half as deep. Rows are new for Adam: gradients of smaller leaves are smaller.
+        values = raw_of(self.depths(rows) / 2)[:, None], self.coefficients()[rows]
+        return [RowChange(table, kept[:0], fresh) for table, fresh in zip(tables, values, strict=True)]
 
 
 METHOD = Method(VoxelsConfig(), paper="arXiv:2112.05131", model=Voxels, decide=decide)

@@ -42,9 +42,13 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Generated data goes to a folder of this test session, not to the user's cache."""
-    os.environ["NERFLOOM_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+def _cache(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> None:
+    """Generated data goes to a folder of this test session, not to the user's cache. Its processes share it."""
+    folder = tmp_path_factory.getbasetemp()
+    if hasattr(request.config, "workerinput"):  # each process of pytest-xdist has a folder within the session's
+        folder = folder.parent
+    (folder / "cache").mkdir(exist_ok=True)
+    os.environ["NERFLOOM_CACHE"] = str(folder / "cache")
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -86,8 +87,8 @@ def photographed(motion: Motion, count: int, size: int = 100, seed: int = 0) -> 
         rays = cameras.pixel_rays(cameras.image_pixels(image), 0.1, 8)
         pixels[image, hits(rays.origins, rays.directions, [*motion(time), STILL])] = 255
     scene = Scene(BOX, 0.1, 8.0, count, True, True, size, num_times=count)
-    names = tuple(f"{image}.png" for image in range(count))
-    return Dataset(pixels.view(-1, 4), cameras, times, names, scene, torch.eye(4)[:3], 1.0), times
+    paths = tuple(Path(f"{image}.png") for image in range(count))
+    return Dataset(pixels.view(-1, 4), cameras, times, paths, scene, torch.eye(4)[:3], 1.0), times
 
 
 def lost(hulls: Tensor, box: Tensor, motion: Motion, points: int = 500, moments: int = 101) -> float:

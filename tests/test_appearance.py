@@ -76,7 +76,7 @@ def test_it_looks_at_few_pixels() -> None:
     assert np.array_equal(light_of(image), light_of(other))
 
 
-def test_photographs_of_which_nothing_is_left_are_passed_over() -> None:
+def test_photographs_without_usable_pixels_are_passed_over() -> None:
     nothing = np.full((3, 5), np.nan, np.float32)
     light = np.stack([light_of(stored(scene(0))), nothing, light_of(stored(scene(0) * 2))])
     assert light_spread(torch.from_numpy(light)) == pytest.approx(0.5, rel=0.1)

@@ -4,6 +4,8 @@ import ast
 import functools
 import importlib
 import inspect
+import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,7 +24,23 @@ def named(file: Path) -> str:
 
 @functools.cache
 def tree(file: Path) -> ast.Module:
-    return ast.parse(file.read_text(encoding="utf-8"))
+    """A file's syntax, by that of the oldest supported Python."""
+    return ast.parse(file.read_text(encoding="utf-8"), feature_version=(3, 10))
+
+
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All statements below a node. To walk through their expressions, too, would take most of the time."""
+    for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for item in getattr(node, name, ()):
+            yield item
+            yield from statements(item)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forgotten() -> Iterator[None]:
+    """A million objects, which every search for garbage in the tests after these would go through."""
+    yield
+    tree.cache_clear()
 
 
 def module_of(file: Path) -> str:
@@ -31,10 +49,10 @@ def module_of(file: Path) -> str:
     return ".".join(["nerfloom", *({"framework": ()}.get(folder, (folder,))), *rest])
 
 
-def imports(node: ast.AST) -> set[str]:
-    """Modules named by import statements anywhere below `node`, `from a import b` as a and a.b."""
+def imports(items: Iterable[ast.AST]) -> set[str]:
+    """Modules named by import statements, `from a import b` as a and a.b."""
     found = set()
-    for item in ast.walk(node):
+    for item in items:
         if isinstance(item, ast.Import):
             found |= {alias.name for alias in item.names}
         elif isinstance(item, ast.ImportFrom) and item.module:
@@ -52,18 +70,27 @@ def test_the_framework_knows_no_method_and_no_format() -> None:
     found = {
         f"{named(file)} imports {name}"
         for file in FILES
-        for name in imports(tree(file))
+        for name in imports(statements(tree(file)))
         if f"{name}.".startswith(tuple(f"{each}." for each in unknown[file.relative_to(ROOT).parts[0]]))
         or name.split(".")[0] in PACKAGES
     }
     assert found == set()
 
 
+@pytest.mark.medium
+def test_python_3_10_syntax() -> None:
+    """The oldest supported Python must be able to compile every file."""
+    assert len(FILES) > 30
+    for file in FILES:
+        tree(file)
+    assert sys.version_info >= (3, 10)
+
+
 def test_sizes() -> None:
     assert [named(file) for file in FILES if len(file.read_text(encoding="utf-8").splitlines()) > 400] == []
     methods = (ROOT / "methods").glob("[!_]*.py")
     assert [named(file) for file in methods if len(file.read_text(encoding="utf-8").splitlines()) > 250] == []
-    functions = [(file, n) for file in FILES for n in ast.walk(tree(file)) if isinstance(n, ast.FunctionDef)]
+    functions = [(file, n) for file in FILES for n in statements(tree(file)) if isinstance(n, ast.FunctionDef)]
     long = [(named(file), n.name) for file, n in functions if (n.end_lineno or 0) - n.lineno + 1 > 65]
     assert long == []
 
@@ -115,7 +142,7 @@ def test_every_setting_has_a_help_text() -> None:
     """The string under a field is its help on the command line."""
     checked = 0
     for file in FILES:
-        for node in ast.walk(tree(file)):
+        for node in statements(tree(file)):
             if not (isinstance(node, ast.ClassDef) and node.name.endswith(("Config", "Flags"))):
                 continue
             bases = {getattr(base, "id", "") for base in node.bases}
@@ -179,10 +206,11 @@ def _room(module: str) -> int | None:
     return next((level for level, rooms in enumerate(LAYERS) if parts[1] in rooms), None)
 
 
-def _runtime_imports(node: ast.AST) -> set[str]:
-    """`imports`, less those for type checkers alone."""
-    checked = [item for item in ast.walk(node) if isinstance(item, ast.If) and "TYPE_CHECKING" in ast.dump(item.test)]
-    return imports(node) - {name for item in checked for name in imports(item)}
+def _runtime_imports(file: Path) -> set[str]:
+    """`imports` anywhere in a file, less those for type checkers alone."""
+    found = list(statements(tree(file)))
+    checked = [item for item in found if isinstance(item, ast.If) and "TYPE_CHECKING" in ast.dump(item.test)]
+    return imports(found) - {name for item in checked for name in imports(statements(item))}
 
 
 @pytest.mark.medium
@@ -193,7 +221,7 @@ def test_imports_run_one_way_through_the_rooms() -> None:
         level = _room(module)
         if level is None or module == "nerfloom.registry":  # it finds modules above it by name
             continue
-        for name in sorted(_runtime_imports(tree(file))):
+        for name in sorted(_runtime_imports(file)):
             other = _room(name)
             if other is not None and other > level:
                 upwards.append(f"{module} imports {name}")
@@ -211,16 +239,16 @@ FRONTS = ("nerfloom", "nerfloom.edit", "nerfloom.testing")
 
 
 def test_names_are_imported_from_the_file_that_defines_them() -> None:
-    files = {module_of(file).removesuffix(".__init__"): file for file in FILES}
+    files, known = {module_of(file).removesuffix(".__init__"): file for file in FILES}, set(FILES)
 
     @functools.cache
     def borrowed(module: str) -> set[str]:
-        nodes = ast.walk(tree(files[module]))
-        return {name.asname or name.name for n in nodes if isinstance(n, ast.ImportFrom) for name in n.names}
+        found = (node for node in statements(tree(files[module])) if isinstance(node, ast.ImportFrom))
+        return {name.asname or name.name for node in found for name in node.names}
 
     elsewhere = []
     for file in [*FILES, *(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
-        for node in ast.walk(tree(file)):
+        for node in statements(tree(file) if file in known else ast.parse(file.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.ImportFrom) or node.module not in files or node.module in FRONTS:
                 continue
             named = {alias.name for alias in node.names if f"{node.module}.{alias.name}" not in files}
@@ -232,7 +260,7 @@ def test_names_are_imported_from_the_file_that_defines_them() -> None:
 def test_no_import_circles() -> None:
     """Imports anywhere in a file count: an import in a function is late, and hides a circle."""
     names = {module_of(file): file for file in FILES if file.name != "__init__.py"}
-    edges = {name: _runtime_imports(tree(file)) & names.keys() for name, file in names.items()}
+    edges = {name: _runtime_imports(file) & names.keys() for name, file in names.items()}
     finished: set[str] = set()
 
     def visit(name: str, path: tuple[str, ...]) -> None:

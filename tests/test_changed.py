@@ -13,11 +13,15 @@ class Settings:
     size: int = 3
     last_step: float = 0.5
 
+    shape = "round"  # an attribute of the class, and no setting
+
 
 def test_values_replace_those_of_their_name_and_none_keeps_one() -> None:
     assert changed(Settings(), {"size": 0, "last_step": None, "unknown": None}, "a run") == Settings(0, 0.5)
     with pytest.raises(ConfigError, match="--other-size has no effect with a run"):
         changed(Settings(), {"size": 1, "other_size": 2}, "a run")
+    with pytest.raises(ConfigError, match="--shape has no effect with a run"):
+        changed(Settings(), {"shape": "square"}, "a run")
 
 
 def test_only_values_that_are_given_are_refused() -> None:

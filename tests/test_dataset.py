@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import assemble, existing_files, load_dataset
@@ -105,6 +105,18 @@ def test_palette_images_keep_their_transparency(tmp_path: Path) -> None:
     picture.putdata([0, 1])
     picture.save(tmp_path / "p.png", transparency=1)
     assert read_image(tmp_path / "p.png").tolist() == [[[10, 20, 30, 255], [200, 100, 50, 0]]]
+
+
+def test_a_file_is_decoded_once(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed_scene, decoded = Blender().parse(tiny, "train"), []
+    prepare_to_decode = PngImagePlugin.PngImageFile.load_prepare
+
+    def noted(image: PngImagePlugin.PngImageFile) -> None:
+        decoded.append(image)
+        prepare_to_decode(image)
+
+    monkeypatch.setattr(PngImagePlugin.PngImageFile, "load_prepare", noted)
+    assert len(load_dataset(parsed_scene, "train")) == len(decoded) == 10
 
 
 def test_an_opaque_set_has_no_alpha_and_is_kept_in_three_channels(tiny: Path) -> None:

@@ -37,6 +37,16 @@ EXTERNAL_BASES = {"nn.Module": nn.Module}
 """Base classes from other packages with methods that are overridden here."""
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+written = cache(ast.unparse)
+"""The source of a node; bases of classes are asked for once for each of their methods."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forgotten() -> Iterator[None]:
+    """A million objects, which every search for garbage in the tests after these would go through."""
+    yield
+    for kept in (written, _parsed, _classes):
+        kept.cache_clear()
 
 
 def problems(module: ast.Module, classes: dict[str, ast.ClassDef]) -> Iterator[str]:
@@ -59,12 +69,12 @@ def _public(node: ast.AST) -> TypeGuard[Definition]:
 
 def _decorated(node: Definition, *names: str) -> bool:
     calls = (item.func if isinstance(item, ast.Call) else item for item in node.decorator_list)
-    return any(ast.unparse(call).split(".")[-1] in names for call in calls)
+    return any(written(call).split(".")[-1] in names for call in calls)
 
 
 def _overrides(name: str, owner: ast.ClassDef, classes: dict[str, ast.ClassDef]) -> bool:
     """Whether a base class of `owner` has a method or a field of this name."""
-    for base in map(ast.unparse, owner.bases):
+    for base in map(written, owner.bases):
         ancestor = classes.get(base.partition("[")[0].split(".")[-1])
         if hasattr(EXTERNAL_BASES.get(base), name):
             return True
@@ -105,20 +115,20 @@ def _arguments(node: Definition) -> tuple[list[str], set[str]]:
         text = ast.get_docstring(init) or ""
         names, said = _arguments(init)
         return names, {*said, *_entries(text, "Args"), *_in_backticks(text)}
-    if not _decorated(node, "dataclass") and "NamedTuple" not in map(ast.unparse, node.bases):
+    if not _decorated(node, "dataclass") and "NamedTuple" not in map(written, node.bases):
         return [], set()
     names, described = [], set()
     for item, after in pairwise([*node.body, ast.Pass()]):
-        if isinstance(item, ast.AnnAssign) and "ClassVar" not in ast.unparse(item.annotation):
-            names += [ast.unparse(item.target)] * (not ast.unparse(item.target).startswith("_"))
+        if isinstance(item, ast.AnnAssign) and "ClassVar" not in written(item.annotation):
+            names += [written(item.target)] * (not written(item.target).startswith("_"))
             if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
-                described.add(ast.unparse(item.target))
+                described.add(written(item.target))
     return names, described
 
 
 def _said_by_type(argument: ast.arg) -> bool:
     """Whether an argument is called like its type, such as `scene: Scene` and the settings `config: NerfactoConfig`."""
-    kind = "" if argument.annotation is None else ast.unparse(argument.annotation).split("[")[0].split(".")[-1]
+    kind = "" if argument.annotation is None else written(argument.annotation).split("[")[0].split(".")[-1]
     return kind.lower() == argument.arg or (argument.arg == "config" and kind.removesuffix("T").endswith("Config"))
 
 

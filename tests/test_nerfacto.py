@@ -9,7 +9,7 @@ import torch
 
 from nerfloom.base.machine_config import MachineConfig
 from nerfloom.data.scene import Scene
-from nerfloom.evaluation.appearance import appearance_of, fit_appearance
+from nerfloom.evaluation.appearance import fit_appearance
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.fields.appearance import Appearance
 from nerfloom.registry import load_method
@@ -190,7 +190,7 @@ def test_the_mean_appearance_is_what_photographs_have_in_common(
     assert off[0.25] < 0.6 * off[0.0]
     monkeypatch.setattr("nerfloom.evaluation.appearance.STEPS", 0)
     model, dataset = trainer.model, trainer.train_set
-    appearance = appearance_of(model)
+    appearance = model.appearance
     assert appearance is not None
     for index in range(0, len(factors), 3):  # of either light
         start = fit_appearance(model, dataset, dataset.cameras.image_pixels(index).view(-1), torch.zeros(3))

@@ -69,7 +69,7 @@ def test_images_of_different_sizes_share_one_buffer() -> None:
     ones = torch.ones(2)
     cameras = Cameras(torch.eye(4)[:3].repeat(2, 1, 1), ones, ones, ones, ones, sizes[:, 0], sizes[:, 1])
     scene = Scene(torch.zeros(2, 3), 0, 1, 2, False, False, 5)
-    data = Dataset(pixels, cameras, None, ("a", "b"), scene, torch.eye(4)[:3], 1.0)
+    data = Dataset(pixels, cameras, None, (Path("a"), Path("b")), scene, torch.eye(4)[:3], 1.0)
     assert data.image(0).shape == (2, 4, 3)
     assert data.image(1).shape == (5, 3, 3)
     torch.manual_seed(0)

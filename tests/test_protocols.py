@@ -12,20 +12,20 @@ from torch import nn
 import nerfloom
 from nerfloom.base.optimised import DefersGradient
 from nerfloom.base.protocols import SeesRegistered
+from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.encodings.hash_grid import HashGrid
-from nerfloom.fields.appearance import Appearance
-from nerfloom.renderable import HasAppearance, RefinesPoses
+from nerfloom.renderable import RefinesPoses
 from nerfloom.samplers.base import Carved, SkipsCells, StopsEarly
 from nerfloom.samplers.occupancy import OccupancySampler
 
 CUBE = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
-WITH_ATTRIBUTES = (Carved, SkipsCells, StopsEarly, HasAppearance, RefinesPoses, DefersGradient)
+WITH_ATTRIBUTES = (Carved, SkipsCells, StopsEarly, RefinesPoses, DefersGradient)
 
 
-class WithAppearance(nn.Module):
+class WithPoses(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        self.appearance = Appearance(3, 4)
+        self.poses = PoseRefinement(4, "SE3", torch.eye(3, 4).repeat(4, 1, 1))
 
 
 def members(kind: Any) -> set[str]:
@@ -47,14 +47,14 @@ def test_buffers_parameters_and_parts_are_seen() -> None:
     assert isinstance(grid, SkipsCells)
     assert isinstance(grid, Carved)
     assert isinstance(grid, StopsEarly)
-    assert isinstance(WithAppearance(), HasAppearance)
+    assert isinstance(WithPoses(), RefinesPoses)
     assert isinstance(HashGrid(num_levels=2, log2_table_size=8), DefersGradient)
 
 
 @pytest.mark.usefixtures("asked")
 def test_what_lacks_one_is_none_of_the_kind() -> None:
     assert not isinstance(nn.Linear(2, 2), SkipsCells)
-    assert not isinstance(nn.Linear(2, 2), HasAppearance)
+    assert not isinstance(nn.Linear(2, 2), RefinesPoses)
     grid = OccupancySampler(CUBE, resolution=4)
     del grid.carved
     assert not isinstance(grid, SkipsCells)

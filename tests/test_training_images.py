@@ -58,7 +58,7 @@ def test_held_out_images_stay_and_no_scene_is_placed_anew(tmp_path: Path) -> Non
 @pytest.mark.parametrize("indices", [(1, 1), (0, 99), (-1,)])
 def test_images_that_are_not_there_are_named(indices: tuple[int, ...], tmp_path: Path) -> None:
     parsed = Nerfstudio().parse(write_capture(tmp_path / "capture"), "train")
-    with pytest.raises(ConfigError, match=r"--train-image-indices .*: each must be from 0 to \d+ and given once$"):
+    with pytest.raises(ConfigError, match=r"--train-image-indices: -?\d+ must be from 0 to \d+ and be given once$"):
         chosen_images(parsed, None, indices)
 
 

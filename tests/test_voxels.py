@@ -28,7 +28,7 @@ from nerfloom.losses.leaf_variation import SMOOTH, leaf_variation
 from nerfloom.methods.voxels import METHOD, Voxels
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.grid import Grid
-from nerfloom.octrees.growth import moments, split, visible
+from nerfloom.octrees.growth import UNMET, moments, split, visible
 from nerfloom.octrees.hull import Hull, overlapped
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.loaded import Loaded
@@ -175,6 +175,10 @@ def test_what_stays() -> None:
     assert visible(peaks, 0.1, 2).tolist() == [0, 3]
     assert visible(peaks, 0.95, 9).tolist() == [0, 1, 2, 3, 4]  # nothing is known yet
     assert visible(peaks[:0], 0.1, 9).tolist() == []
+    peaks = torch.tensor([0.3, UNMET, 0.1, 0.0])
+    assert visible(peaks, 0.1, 9).tolist() == [0, 1, 2]
+    assert visible(peaks, 0.1, 2).tolist() == [0, 2]
+    assert visible(peaks[1::2], 0.1, 9).tolist() == [0, 1]
 
 
 def test_leaves_are_eighths_of_cells() -> None:
@@ -198,7 +202,7 @@ def test_a_split_keeps_the_picture(degree: int) -> None:
     assert model.layout.num_leaves == 8 * 512
     assert model.layout.cell == pytest.approx(layout.cell / 2)
     assert model.peaks.shape == (8 * 512,)
-    assert not model.peaks.any()
+    assert bool((model.peaks == UNMET).all())
     assert all(not state["exp_avg"].any() and len(state["exp_avg"]) == 8 * 512 for state in optimizer.state.values())
 
 
@@ -218,6 +222,27 @@ def test_dropped_leaves_change_a_ray_by_their_weights_at_most() -> None:
     assert float(differences.max()) > 0.01
     assert bool((differences <= bound + 1e-5).all())
     assert all(bool(state["exp_avg"].all()) for state in optimizer.state.values())  # kept leaves go on
+
+
+def test_leaves_that_no_ray_has_met_stay_once() -> None:
+    """Three leaves: one behind an opaque one, one that all rays pass by, and the opaque one."""
+    model = built(degree=0)
+    cells = torch.tensor([[0, 0, 3], [5, 5, 3], [0, 0, 7]])
+    layout, order = OctreeLayout.build(torch.full((3,), -0.5), 0.125, (1, 1, 1), cells)
+    assert order.tolist() == [0, 1, 2]
+    model.set_octree(layout, torch.tensor([[1.0], [1.0], [20.0]]), torch.full((3, 3), 0.5 / CONSTANT))
+    places = 0.1 * torch.rand(64, 2) - 0.49
+    rays = Rays(torch.cat([places, torch.full((64, 1), 3.0)], -1), torch.tensor([0.0, 0.0, -1.0]).repeat(64, 1))
+    batch = PixelBatch(torch.arange(64), rays, torch.rand(64, 3), torch.rand(64, 3), torch.ones(64))
+    assert model.peaks.tolist() == [UNMET] * 3
+    train_step(model, make_optimizer(model, model.config), batch, 1, 0.1)
+    change(model, 0)
+    assert model.layout.cells().tolist() == [[5, 5, 3], [0, 0, 7]]
+    assert model.peaks.tolist() == [0, UNMET]
+    train_step(model, make_optimizer(model, model.config), batch, 1, 0.1)
+    change(model, 1)
+    assert (model.layout.cells() // 2).tolist() == [[0, 0, 7]] * 8
+    assert model.peaks.tolist() == [UNMET] * 8
 
 
 def test_no_more_leaves_than_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
@@ -299,6 +324,7 @@ def test_cells_follow_the_images_and_the_time() -> None:
         ({"unbounded": True}, {}, "extends beyond its box: take a method for captures"),
         ({"warped": True}, {}, "leave out --ndc"),
         ({}, {"depth_loss_mult": 0.1}, "--depth-loss-mult is 0.1"),
+        ({}, {"appearance": "affine"}, "--appearance is affine, and .* learns one light"),
         ({}, {"resolution": 2048, "num_splits": 1}, "raise --num-splits"),
     ],
 )
@@ -327,7 +353,7 @@ def test_damaged_checkpoints_are_refused() -> None:
         assert "\n" not in str(error.value)
 
 
-def test_a_run_is_written_as_an_octree() -> None:
+def test_a_run_is_written_as_an_octree(capsys: pytest.CaptureFixture[str]) -> None:
     """Without learning anew; where a file must be smaller, with the leaves that images see best."""
     model, rays = filled(), some_rays()
     datasets = {"train": ball_in_a_box()}
@@ -338,5 +364,6 @@ def test_a_run_is_written_as_an_octree() -> None:
     torch.testing.assert_close(drawn, colors(model, rays), atol=0.03, rtol=0)
     small = bake(loaded, Baking(max_bytes=2000))
     assert 100 < small.layout.num_leaves < 200
+    assert f"0.002 MB hold {small.layout.num_leaves} of 512 leaves" in capsys.readouterr().err
     with pytest.raises(ConfigError, match="--degree is 2"):
         bake(loaded, Baking(degree=2))

@@ -25,13 +25,12 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import say, track
-from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.errors import FlagError
 from nerfloom.cli.common import run_command
-from nerfloom.cli.flags import read_flags
 from nerfloom.dataparsers.procedural.environment import Environment, make_environment
 from nerfloom.dataparsers.procedural.scene import Colour, Part, checks, trace_rows
 from nerfloom.dataparsers.procedural.shapes import Box, Shape, Sphere, Torus, dot
-from nerfloom.dataparsers.procedural.solids import poses_around
+from nerfloom.dataparsers.procedural.solids import SolidsFlags, flags_of, poses_around
 from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, complete_folder, lay_out
 from nerfloom.kernels.color import to_srgb
 from nerfloom.kernels.native import torch_on_one_thread
@@ -220,36 +219,19 @@ def write_shiny(
 
 
 @dataclass(frozen=True)
-class ShinyFlags:
-    """Write data sets of shiny solids with exact normals."""
+class ShinyFlags(SolidsFlags):
+    """Write data sets of shiny solids with exact normals, each into a folder within --folder."""
 
-    folder: Path
-    """Folder to create; each scene is a folder within it."""
-    size: int = 400
-    """Width and height of the images, pixels."""
-    num_train: int = 100
-    """Number of training images of a scene."""
-    num_test: int = 20
-    """Number of test images of a scene."""
     environment: int = 0
     """Seed of the lamps that light the solids."""
 
 
 def _command(arguments: list[str]) -> None:
-    if arguments and not arguments[0].startswith("-"):
-        arguments = ["--folder", *arguments]
-    flags = read_flags(ShinyFlags, "python -m nerfloom.dataparsers.procedural.shiny", arguments, takes="FOLDER")
-    if min(flags.size, flags.num_train, flags.num_test) < 1:
-        raise FlagError("--size, --num-train and --num-test must be at least 1")
+    flags = flags_of(ShinyFlags, "shiny", arguments)
     if flags.environment < 0:
         raise FlagError("--environment must be at least 0")
-    if flags.folder.exists():
-        raise ConfigError(f"{flags.folder} exists already; name another folder")
-
-    def shown(jobs: Any, total: int) -> Any:
-        return track(jobs, "Rendering the shiny scenes", total)
-
-    write_shiny(flags.folder, flags.size, flags.num_train, flags.num_test, flags.environment, shown)
+    progress = lambda jobs, total: track(jobs, "Rendering the shiny scenes", total)  # noqa: E731
+    write_shiny(flags.folder, flags.size, flags.num_train, flags.num_test, flags.environment, progress)
     say(f"{flags.folder}: {', '.join(SCENES)}; ns-train METHOD --data {flags.folder}/{next(iter(SCENES))}")
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -132,24 +132,34 @@ class SolidsFlags:
     size: int = 400
     """Width and height of the images, pixels."""
     num_train: int = 100
-    """Number of training images."""
+    """Number of training images of a scene."""
     num_test: int = 20
-    """Number of test images."""
+    """Number of test images of a scene."""
 
 
-def _command(arguments: list[str]) -> None:
+FlagsT = TypeVar("FlagsT", bound=SolidsFlags)
+
+
+def flags_of(kind: type[FlagsT], name: str, arguments: list[str]) -> FlagsT:
+    """Return the flags of a class `kind` from the `arguments` of the module `name` of this package, run as a program.
+
+    Raises:
+        ConfigError: if a number is out of range, or the folder exists.
+    """
     if arguments and not arguments[0].startswith("-"):
         arguments = ["--folder", *arguments]
-    flags = read_flags(SolidsFlags, "python -m nerfloom.dataparsers.procedural.solids", arguments, takes="FOLDER")
+    flags: FlagsT = read_flags(kind, f"python -m nerfloom.dataparsers.procedural.{name}", arguments, takes="FOLDER")
     if min(flags.size, flags.num_train, flags.num_test) < 1:
         raise FlagError("--size, --num-train and --num-test must be at least 1")
     if flags.folder.exists():
         raise ConfigError(f"{flags.folder} exists already; name another folder")
+    return flags
 
-    def shown(jobs: Any, total: int) -> Any:
-        return track(jobs, "Rendering the solids", total)
 
-    write_solids(flags.folder, flags.size, flags.num_train, flags.num_test, shown)
+def _command(arguments: list[str]) -> None:
+    flags = flags_of(SolidsFlags, "solids", arguments)
+    progress = lambda jobs, total: track(jobs, "Rendering the solids", total)  # noqa: E731
+    write_solids(flags.folder, flags.size, flags.num_train, flags.num_test, progress)
     say(f"{flags.folder}: images, and {REFERENCE}, their exact surface; ns-train METHOD --data {flags.folder}")
 
 

@@ -18,7 +18,8 @@ def changed(settings: T, given: Mapping[str, Any], what: str) -> T:
         ConfigError: if there is no setting of a name.
     """
     new = {name: value for name, value in given.items() if value is not None}
-    refuse({name: value for name, value in new.items() if not hasattr(settings, name)}, what)
+    names = {field.name for field in dataclasses.fields(settings)}  # type: ignore[arg-type]
+    refuse({name: value for name, value in new.items() if name not in names}, what)
     return dataclasses.replace(settings, **new)  # type: ignore[type-var]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import shlex
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 SETTINGS = {
     "camera-optimizer.mode": "--camera-optimizer",
@@ -125,11 +125,25 @@ RENDERING = {
 """First part of a flag of nerfstudio's ns-render without an equivalent of the same name -> the answer."""
 
 
-def render_answer(flag: str) -> str | None:
-    """Return the answer to a `flag` of nerfstudio's ns-render, possibly with =VALUE; None for other words."""
+EXPORTING = {
+    "bounding-box-min": "here it is --crop-box X,Y,Z,X,Y,Z, with both corners",
+    "bounding-box-max": "here it is --crop-box X,Y,Z,X,Y,Z, with both corners",
+    "use-bounding-box": "leave it out; only --crop-box, --crop-sphere and --region cut something off",
+    "obb-center": "here it is --crop-box X,Y,Z,X,Y,Z, or a rotated box in the file of --region",
+    "obb-rotation": "here it is a rotated box in the file of --region",
+    "obb-scale": "here it is --crop-box X,Y,Z,X,Y,Z, or a rotated box in the file of --region",
+    "save-world-frame": "leave it out; all files are in the frame of the input",
+    "normal-method": "leave it out; normals are those of the surface",
+    "num-rays-per-batch": "leave it out; it is a setting of the run",
+}
+"""First part of a flag of nerfstudio's ns-export without an equivalent of the same name -> the answer."""
+
+
+def command_answer(flag: str, answers: Mapping[str, str], command: str) -> str | None:
+    """Return the answer to a `flag` of a `command` of nerfstudio, possibly with =VALUE; None for other words."""
     name = flag.removeprefix("--").partition("=")[0].replace("_", "-")
-    answer = RENDERING.get(name.partition(".")[0]) if flag.startswith("--") else None
-    return None if answer is None else f"--{name} is nerfstudio's; {answer}"
+    answer = answers.get(name.partition(".")[0]) if flag.startswith("--") else None
+    return None if answer is None else f"--{name} is of nerfstudio's {command}; {answer}"
 
 
 def vis_answer(value: str) -> str | None:

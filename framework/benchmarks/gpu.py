@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +113,7 @@ def measured_kernels(device: torch.device, samples: int, repeats: int, seconds: 
         ceilings = Ceilings.measured(COPIED, EDGE) if device.type == "cuda" else Ceilings.measured()
         for line in ceilings.lines():
             say(f"ceiling: {line}")
-        for kernel in (*on_any_device(samples), *along_rays(samples)):
+        for kernel in chain(on_any_device(samples), along_rays(samples)):  # each frees the inputs of the one before
             if time.monotonic() - start > seconds:
                 late.append(kernel.name)
                 continue

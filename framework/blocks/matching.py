@@ -1,4 +1,4 @@
-"""Matching of the colours of neighbouring blocks, by pictures of the images that they share."""
+"""Search for colours that make blocks match their neighbours, by pictures of the images that they share."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from nerfloom.cameras.view import View
 from nerfloom.rendering.light import without_background
 
 MAX_VIEWS = 6
-"""Maximum number of images used to match two blocks."""
+"""Maximum number of shared images that match the colours of two blocks."""
 SIDE = 48
-"""Longer side of the pictures that are compared, pixels, at most twice this."""
+"""Minimum length of the longer side of the compared pictures, pixels. It is less than twice this."""
 
 
 def matched(model: Blocks, cameras: Cameras, times: Tensor | None) -> list[TrainedBlock]:

@@ -14,7 +14,7 @@ from nerfloom.cameras.cameras import Cameras
 SURFACE = 1.05
 """A point up to this multiple of a surface's distance counts as in front of it."""
 SIMILAR = math.cos(math.radians(20))
-"""Minimum cosine of the angle between two directions that see a point alike."""
+"""Minimum cosine of the angle between two directions towards a point if it looks alike from both."""
 NEAREST, FARTHEST = 0.02, 2.0
 """Range of the distances of points from the cameras that look at them, in radii of the block."""
 SCATTER = 0.1
@@ -64,7 +64,7 @@ class Sights:
 
 
 def queries(cameras: Cameras, radius: float, count: int) -> tuple[Tensor, Tensor]:
-    """Return points to learn from, (N, 3), and the viewing directions, (N, 3); N is about `count`.
+    """Return points to learn from, (N, 3), and directions towards them, (N, 3); N is about `count`.
 
     They are seen from places near training cameras, one half in directions of training images, the other half in any
     direction. Distances are distributed evenly by their logarithm.

@@ -55,7 +55,7 @@ class Visibility(nn.Module):
             self.layers = nn.ModuleList(nn.Linear(before, after) for before, after in pairwise(WIDTHS))
 
     def inputs(self, points: Tensor, directions: Tensor) -> Tensor:
-        """Return the inputs (N, C) float32 of points and viewing directions.
+        """Return the inputs (N, C) float32 of points and of the directions towards them.
 
         Args:
             points: (N, 3) positions in the input's frame.

@@ -139,6 +139,7 @@ class Cameras:
             pixel_radii=pixel_radii,
             times=None if times is None else times[camera_indices],
             camera_indices=camera_indices,
+            parallel=self.model == "orthographic",
         )
 
     def look(self, camera_indices: Tensor, columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, LensRays]:

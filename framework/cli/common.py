@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import nerfloom
 from nerfloom.base.console import console, say
 from nerfloom.base.errors import ConfigError, FlagError, LostProcessError, NerfloomError, is_out_of_memory, nearest
-from nerfloom.base.from_nerfstudio import KINDS
+from nerfloom.base.from_nerfstudio import KINDS, command_answer
 from nerfloom.base.signals import exit_status, orderly_end
 from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
@@ -50,6 +50,21 @@ def chosen_kind(
     if name not in kinds:
         raise ConfigError(f"{unknown} '{name}'. {nearest(name, list(kinds))}")
     return name, kinds[name], arguments[1:]
+
+
+def refuse_foreign(arguments: list[str], answers: Mapping[str, str], command: str) -> None:
+    """Refuse the flags of nerfstudio's `command` that do not exist here.
+
+    Args:
+        arguments: arguments of the command.
+        answers: a table of `from_nerfstudio`: what to use here.
+        command: name of the command.
+
+    Raises:
+        FlagError: with the answer to the first such flag.
+    """
+    if answer := next(filter(None, (command_answer(word, answers, command) for word in arguments)), None):
+        raise FlagError(answer)
 
 
 def with_run(arguments: list[str], several: Collection[str] = (), flag: str = "--load-config") -> list[str]:

@@ -43,7 +43,7 @@ class EditFlags(RegionFlags, OpenFlags):
     reduce_to: int | None = None
     """Number of Gaussians to keep: the ones with most weight in training images, or by opacity and area."""
     refit_steps: int = 0
-    """Steps of training that make the Gaussians of --reduce-to look like all of them, for files and runs with
+    """Number of steps that make the Gaussians of --reduce-to look like all of them, for files and runs with
     photographs, such as 300; 0: none."""
     degree: int | None = None
     """Highest degree of harmonics to keep, 0 to 3."""

@@ -77,7 +77,7 @@ def _made(flags: GeometryFlags, loaded: Loaded, reference: Surface, kind: Surfac
     low = high = None
     if flags.crop is not None:
         low, high = (tuple(corner.tolist()) for corner in region_of(reference, flags.crop))
-    mesh = surface_mesh(loaded, kind, flags.surface_resolution, low, high)
+    mesh = surface_mesh(loaded, kind, flags.surface_resolution, low, high, whole=flags.min_views == 0)
     return usable(Surface(mesh.vertices, mesh.faces), f"the mesh by {kind}")[0]
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format, with_run
+from nerfloom.base.from_nerfstudio import EXPORTING
+from nerfloom.cli.common import chosen_kind, make_room, refuse_foreign, run_command, with_format, with_run
 from nerfloom.cli.export_flags import (
     CameraFlags,
     LevelsFlags,
@@ -52,6 +53,7 @@ def _command(arguments: list[str]) -> None:
     if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
         return
     name, (kind, file), rest = chosen
+    refuse_foreign(rest, EXPORTING, "ns-export")
     words, named = with_format(f"ns-export {name}", with_run(rest))
     flags = read_flags(kind, f"ns-export {name}", words, takes=OPENS)
     found = flags.check()

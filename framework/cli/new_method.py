@@ -102,7 +102,7 @@ def write_package(name: str, folder: Path) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(content, encoding="utf-8", newline="\n")
     except OSError as error:
-        raise ConfigError(f"cannot write {folder}: {error.strerror}") from error
+        raise ConfigError(f"cannot write {folder}: {error.strerror}; choose another --dir") from error
 
 
 if __name__ == "__main__":

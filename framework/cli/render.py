@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerfloom.base.errors import FlagError
-from nerfloom.base.from_nerfstudio import render_answer
-from nerfloom.cli.common import chosen_kind, make_room, run_command, with_format, with_run
+from nerfloom.base.from_nerfstudio import RENDERING
+from nerfloom.cli.common import chosen_kind, make_room, refuse_foreign, run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.render_flags import FLAGS, USAGE
 from nerfloom.cli.run_flags import OPENS
@@ -28,8 +27,7 @@ def _command(arguments: list[str]) -> None:
     import tyro
 
     name, path, rest = chosen
-    if answer := next(filter(None, map(render_answer, rest)), None):
-        raise FlagError(answer)
+    refuse_foreign(rest, RENDERING, "ns-render")
     words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names"}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)
     flags: Any = read_flags(path, f"ns-render {name}", words, OPENS, config=options)

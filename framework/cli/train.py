@@ -151,22 +151,21 @@ def _parse_flags(run: Run, flags: list[str], fresh: bool = False) -> Run:
 
     _check_for_nerfstudio(flags, run.method, [run.config, parser])
     run = dataclasses.replace(run, dataparser=named, parser=parser)
-    description = f"{summary(registered('methods')[run.method])}\n\nData format: {named}"
-    if _asks_for_help(flags):
-        description += "\n\nThe everyday flags; --help-all shows all, in groups."
+    description = _description(run, flags)
     parsed = _parsed(run, flags, {"method": run.config, "format": parser}, description=description)
     config = limited_as_given(dataclasses.replace(parsed.method, data=data), _names(flags))
     folder = run_folder(run.method, config) if fresh else run.folder
     return dataclasses.replace(run, config=config, parser=parsed.format, folder=folder)
 
 
-def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any) -> Any:
+def _parsed(run: Run, flags: list[str], settings: dict[str, Any], description: str = "", **options: Any) -> Any:
     """Return `settings` changed by `flags`. All flags form one flat set, so that their order does not matter.
 
     Args:
         run: the run, for names and titles.
         flags: the flags.
         settings: settings of the method and of the data format, by name.
+        description: first lines of the help.
         options: further arguments of `tyro.cli`.
 
     Raises:
@@ -176,17 +175,28 @@ def _parsed(run: Run, flags: list[str], settings: dict[str, Any], **options: Any
 
     from nerfloom.cli.flag_groups import grouped_flags
 
-    fields = [(name, Annotated[type(value), tyro.conf.arg(name="")]) for name, value in settings.items()]
+    # Without a help text of their own, tyro would look for one in the source of a class that has none.
+    unnamed = tyro.conf.arg(name="", help="")
+    fields = [(name, Annotated[type(value), unnamed]) for name, value in settings.items()]
     kind = dataclasses.make_dataclass("Flags", fields)
     return read_flags(
         kind,
         f"ns-train {run.method}",
         flags,
         default=kind(**settings),
+        description=description,
         config=(tyro.conf.FlagConversionOff, tyro.conf.CascadeSubcommandArgs),
         registry=grouped_flags(run.method, run.config, run.dataparser, run.parser, _asks_for_help(flags)),
         **options,
     )
+
+
+def _description(run: Run, flags: list[str]) -> str:
+    """Return the first lines of the help; empty if flags do not ask for help, as the method's file must be parsed."""
+    if set(HELP).isdisjoint(flags):
+        return ""
+    lines = f"{summary(registered('methods')[run.method])}\n\nData format: {run.dataparser}"
+    return lines + ("\n\nThe everyday flags; --help-all shows all, in groups." if _asks_for_help(flags) else "")
 
 
 def _asks_for_help(flags: list[str]) -> bool:

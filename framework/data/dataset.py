@@ -48,8 +48,8 @@ class Dataset:
     """M cameras, for the sizes of the decoded images."""
     times: Tensor | None
     """(M,) time of each image; None for a static scene."""
-    names: tuple[str, ...]
-    """M file names, without directory."""
+    paths: tuple[Path, ...]
+    """M image files. Images in memory have names only."""
     scene: Scene
     """Description of the scene for methods."""
     transform: Tensor
@@ -81,6 +81,8 @@ class Dataset:
     """(M,) bool on the CPU, source images, for rendering others; they are not evaluated. None without."""
     training: bool = False
     """Whether these are training images, in the order of a model's vectors for them."""
+    z_is_up: bool = False
+    """Whether +z is up, as the data or their placement say; False if it is unknown."""
     normal_paths: tuple[Path | None, ...] | None = None
     """M files of true normals, read when asked for; None if there are none."""
     motion_bound: MotionBound | None = None
@@ -88,6 +90,11 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """M file names, without directory."""
+        return tuple(path.name for path in self.paths)
 
     @property
     def placement(self) -> Placement:
@@ -258,8 +265,8 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     """Construct a data set from decoded images.
 
     Args:
-        parsed: the parsed scene of these images, with cameras for their decoded sizes. Depth images are read; of all
-            other files only the names are used.
+        parsed: the parsed scene of these images, with cameras for their decoded sizes. Depth images are read; no other
+            file is.
         decoded: the pixels (`decoding.decode` or `decoding.from_arrays`).
         split: name of the split in messages.
         masks: meaning of masked-out pixels; auto: empty if the format says so, otherwise decided by `cuts_out`.
@@ -302,7 +309,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         pixels=decoded.pixels,
         cameras=cameras,
         times=parsed.times,
-        names=names,
+        paths=parsed.image_paths,
         scene=scene,
         transform=parsed.placement.transform,
         scale=parsed.scale,
@@ -317,6 +324,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         scene_indices=parsed.scene_indices,
         source_images=parsed.source_images,
         training=split == "train",
+        z_is_up=parsed.z_is_up,
         normal_paths=parsed.normal_paths,
     )
 

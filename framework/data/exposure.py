@@ -96,7 +96,7 @@ def devices_of(taken: Sequence[Taken] | None, cameras: Cameras) -> Tensor | None
 
 def _read_exif(path: Path) -> Taken:
     try:
-        read_heif(path)
+        read_heif()
         with Image.open(path) as image:
             content = image.info.get("exif")  # `Image.getexif` would decode a PNG without it
         if not isinstance(content, bytes):
@@ -105,14 +105,14 @@ def _read_exif(path: Path) -> Taken:
         exif.load(content)
         details = exif.get_ifd(DETAILS)
         device = " ".join(f"{exif.get(tag, '')}".strip("\0 ") for tag in (MAKER, MODEL)).strip()
-        seconds, f_number, iso = (_positive(details.get(tag)) for tag in (SECONDS, F_NUMBER, ISO))
+        seconds, f_number, iso = (_number(details.get(tag)) for tag in (SECONDS, F_NUMBER, ISO))
         return Taken.of(seconds, f_number, iso, device)
     except Exception:  # of any type, by missing files and by Pillow; a damaged image is reported when it is decoded
         return Taken()
 
 
-def _positive(value: Any) -> float:
-    """Return an entry of EXIF as a number, the first of several; NaN if it is none."""
+def _number(value: Any) -> float:
+    """Return an entry of EXIF as a number, the first of several; NaN if it is not one."""
     first = value[0] if isinstance(value, tuple) and value else value
     try:
         return float(first)

@@ -23,9 +23,9 @@ BAND = 64
 """Number of rows of a reduced image computed at once: float64 takes eight times the memory of the source pixels."""
 
 
-def read_heif(path: Path) -> None:
-    """Let Pillow read HEIC from now on, if `path` is such a file and the package pillow-heif is installed."""
-    if path.suffix.lower() in HEIF_SUFFIXES and install_command("heic") is None:
+def read_heif() -> None:
+    """Let Pillow read HEIC from now on, whatever files are called, if the package pillow-heif is installed."""
+    if install_command("heic") is None:
         from pillow_heif import register_heif_opener
 
         register_heif_opener()
@@ -39,7 +39,7 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
     """
     reason = ""
     for path in paths:
-        read_heif(path)
+        read_heif()
         try:
             height, width = iio.improps(path, plugin="pillow", index=0).shape[:2]  # the first frame of an animation
             if width and height:
@@ -77,12 +77,14 @@ def read_image(path: Path, factor: int = 1) -> np.ndarray:
     Raises:
         DataError: if the image cannot be decoded, or has more than 8 bits per channel.
     """
-    read_heif(path)
+    read_heif()
     try:
-        mode = str(iio.immeta(path, plugin="pillow", index=0).get("mode", ""))
-        if mode.startswith(("I", "F")) or _is_deep_png(path):
-            raise DataError(f"{path} has more than 8 bits per channel; convert it to an 8-bit PNG")
-        image = np.asarray(iio.imread(Content(path), plugin="pillow", mode="RGBA", index=0))
+        content = Content(path)
+        deep = _is_deep_png(content)
+        with Image.open(content) as opened:
+            if deep or opened.mode.startswith(("I", "F")):
+                raise DataError(f"{path} has more than 8 bits per channel; convert it to an 8-bit PNG")
+            image = np.array(opened.convert("RGBA"))
     except DataError:
         raise
     except Exception as error:  # Pillow raises OSError, SyntaxError, struct.error, DecompressionBombError and more
@@ -90,10 +92,10 @@ def read_image(path: Path, factor: int = 1) -> np.ndarray:
     return image if factor == 1 else reduce_image(image, factor)
 
 
-def _is_deep_png(path: Path) -> bool:
+def _is_deep_png(content: Content) -> bool:
     """Return whether a PNG has 16 bits per channel, which Pillow would silently reduce to 8 (bit depth: byte 24)."""
-    with path.open("rb") as file:
-        head = file.read(25)
+    head = content.read(25)
+    content.seek(0)
     return head[:8] == b"\x89PNG\r\n\x1a\n" and head[24:] == b"\x10"
 
 
@@ -128,12 +130,12 @@ def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
 
 def may_be_transparent(path: Path) -> bool:
     """Return whether the header of an image allows for alpha; False if the header of `path` cannot be read."""
-    read_heif(path)
+    read_heif()
     try:
-        meta = iio.immeta(path, plugin="pillow", index=0)
+        with Image.open(path) as image:  # `iio.immeta` would decode a PNG, to look for EXIF behind the pixels
+            return "A" in image.mode.upper() or "transparency" in image.info
     except Exception:  # any type; the file is reported when it is decoded
         return False
-    return "A" in str(meta.get("mode", "")).upper() or "transparency" in meta
 
 
 def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:

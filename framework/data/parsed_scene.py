@@ -54,6 +54,8 @@ class ParsedScene:
     """Whether there may be visible content outside `box`."""
     poses: PoseSource = "exact"
     """Source of the cameras' poses."""
+    z_is_up: bool = False
+    """Whether +z is up, as the data or their placement say; False if it is unknown."""
     appearance_varies: bool = False
     """Whether light, exposure or camera differ between images."""
     depth_paths: tuple[Path | None, ...] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from fractions import Fraction
 
@@ -40,10 +41,9 @@ def chosen_images(parsed: ParsedScene, most: int | None, indices: Sequence[int])
     total = len(parsed.image_paths)
     if indices and most is not None:
         raise ConfigError("--train-image-indices already selects images: leave out --max-train-images")
-    if len(set(indices)) < len(indices) or not all(0 <= index < total for index in indices):
-        raise ConfigError(
-            f"--train-image-indices {' '.join(map(str, indices))}: each must be from 0 to {total - 1} and given once"
-        )
+    wrong = next((index for index, times in Counter(indices).items() if times > 1 or not 0 <= index < total), None)
+    if wrong is not None:
+        raise ConfigError(f"--train-image-indices: {wrong} must be from 0 to {total - 1} and be given once")
     if not indices and (most is None or most >= total):
         return parsed
     return parsed[torch.tensor(list(indices) or evenly_spread(total, most or total))]

@@ -103,7 +103,7 @@ def align_floor(
 ) -> Edited:
     """Find the floor, and turn Gaussians about its middle so that it becomes the plane z = 0.
 
-    The floor is the plane with the most centres of opaque Gaussians near it, and few below it.
+    The floor is a plane: most opaque Gaussians have their centres on it, and few have them below.
 
     Args:
         up: the direction that is about upwards, of any length but 0; None for the up direction of the last `set_up` or

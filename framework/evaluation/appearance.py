@@ -21,22 +21,13 @@ from nerfloom.data.pixels.batch import gather_batch
 from nerfloom.data.scene import Scene
 from nerfloom.fields.appearance import Appearance
 from nerfloom.losses.functions import mean_squared_error
-from nerfloom.renderable import HasAppearance, Renderable, RendersRays, training_poses
+from nerfloom.renderable import Renderable, RendersRays, training_poses
 from nerfloom.samplers.proposal import half_edge
 
 STEPS, PIXELS = 30, 2048
 """Maximum number of steps of L-BFGS for fitting an appearance vector, and of pixels that it is fitted to."""
 MAX_CANDIDATES = 32
 """Maximum number of training images' vectors tried as the initial vector."""
-
-
-def appearance_of(model: Renderable) -> Appearance | None:
-    """Return the appearance vectors of the training images; None if the model has none.
-
-    Args:
-        model: a model of any method.
-    """
-    return model.appearance if isinstance(model, HasAppearance) else None
 
 
 def right_half(image: Tensor) -> Tensor:
@@ -58,7 +49,7 @@ def held_out_appearance(model: Renderable, dataset: Dataset, index: int, backgro
         index: index of the image.
         background: (3,) colour behind transparent pixels.
     """
-    appearance = appearance_of(model)
+    appearance = model.appearance
     if appearance is None or appearance.held_out == "mean":
         yield
     elif appearance.held_out == "half":
@@ -117,7 +108,7 @@ def shown_appearance(model: Renderable, vector: Tensor | None) -> Iterator[None]
         model: the model.
         vector: (D,) appearance vector; None to change nothing.
     """
-    appearance = appearance_of(model)
+    appearance = model.appearance
     with nullcontext() if appearance is None or vector is None else appearance.shown(vector):
         yield
 
@@ -140,7 +131,7 @@ def fit_appearance(
     Returns:
         (D,) vector; None if the model has no appearance vectors.
     """
-    appearance = appearance_of(model)
+    appearance = model.appearance
     if appearance is None:
         return None
     mean = appearance.of_images().detach().mean(0)

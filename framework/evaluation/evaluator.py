@@ -22,7 +22,7 @@ from nerfloom.base.meter import time_text
 from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.appearance import appearance_of, held_out_appearance, right_half
+from nerfloom.evaluation.appearance import held_out_appearance, right_half
 from nerfloom.evaluation.lpips import MIN_SIDE_OF_LPIPS, NETWORK, Lpips, load_lpips
 from nerfloom.evaluation.metrics import MIN_SIDE_OF_SCALES, ms_ssim, psnr, quick_ssim
 from nerfloom.evaluation.normals import normal_mae
@@ -231,7 +231,7 @@ def evaluate(
         ConfigError: if the file of weights is unusable.
         DataError: if there are no images to evaluate.
     """
-    appearance = appearance_of(model)
+    appearance = model.appearance
     half = appearance is not None and appearance.held_out == "half"
     views = views_to_judge(dataset, half)
     asked = [views[rank] for rank in spread(len(views), max_images)]

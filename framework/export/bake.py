@@ -93,7 +93,9 @@ def _as_learnt(model: DrawsOctree, loaded: Loaded, settings: Baking) -> tuple[Oc
     if layout.num_leaves > room_for(settings.max_bytes, degree):
         cameras, scene = loaded.dataset("train").to("cpu").cameras, model.scene
         seen = seen_leaves(layout, raw_of(depths)[:, None], cameras, scene.near, scene.far)
-        layout, rows = layout.part(chosen(seen.largest, settings.max_bytes, (degree,))[1])
+        kept, count = chosen(seen.largest, settings.max_bytes, (degree,))[1], layout.num_leaves
+        say(f"{settings.max_bytes / 1e6:g} MB hold {len(kept):,} of {count:,} leaves: those with the largest weights")
+        layout, rows = layout.part(kept)
         depths, coefficients = depths[rows], coefficients[rows]
     say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, as they were learnt")
     return layout, depths, coefficients

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,6 +23,9 @@ if TYPE_CHECKING:
     from nerfloom.geometry.regions import Region
     from nerfloom.training.loaded import Loaded
 
+    Writer = Callable[[Loaded, Path, Any, Sequence[Region]], None]
+    """Function of what is exported, the file, settings and regions that writes the file."""
+
 MESHES = (".ply", ".obj", ".glb")
 """Suffixes of meshes."""
 
@@ -35,10 +37,10 @@ class Kind(NamedTuple):
     """Class of its settings."""
     suffixes: tuple[str, ...]
     """Suffixes that its file may have."""
-    write: Callable[..., None]
-    """Function of a run or file, the export's file and settings that writes the export."""
+    writer: Callable[[], Writer]
+    """Imports the function that writes the file, and returns it."""
     is_cropped: bool = False
-    """Whether the function also takes regions."""
+    """Whether it takes regions."""
 
 
 def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequence[Region] = ()) -> None:
@@ -66,7 +68,7 @@ def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequen
     path.parent.mkdir(parents=True, exist_ok=True)
     if loaded.scale.is_known:
         say(loaded.scale.words())
-    kind.write(loaded, path, settings, *([regions] if kind.is_cropped else []))
+    kind.writer()(loaded, path, settings, regions)
 
 
 def check_scale(loaded: Loaded) -> None:
@@ -90,33 +92,67 @@ def kind_named(name: str) -> Kind:
     return KINDS[name]
 
 
-def _on_use(name: str) -> Callable[..., None]:
-    """Return `module.function` of this room, imported when it is called, so that the help of the command is fast."""
-
-    def write(*arguments: Any) -> None:
-        module, function = name.split(".")
-        getattr(import_module(f"nerfloom.export.{module}"), function)(*arguments)
-
-    return write
+# Each imports on use, so that the help of the command is fast.
 
 
-def _page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequence[Region]) -> None:
+def _points() -> Writer:
+    from nerfloom.export.point_cloud import export_points
+
+    return export_points
+
+
+def _level_set() -> Writer:
+    from nerfloom.export.run_mesh import export_level_set
+
+    return export_level_set
+
+
+def _fused() -> Writer:
+    from nerfloom.export.run_mesh import export_fused
+
+    return export_fused
+
+
+def _gaussians() -> Writer:
+    from nerfloom.export.run_gaussians import export_gaussians
+
+    return export_gaussians
+
+
+def _levels() -> Writer:
+    from nerfloom.export.run_levels import export_levels
+
+    return export_levels
+
+
+def _cameras() -> Writer:
+    from nerfloom.export.run_cameras import export_cameras
+
+    return lambda loaded, path, settings, _: export_cameras(loaded, path, settings)
+
+
+def _occupancy() -> Writer:
+    from nerfloom.export.run_occupancy import export_occupancy
+
+    return lambda loaded, path, settings, _: export_occupancy(loaded, path, settings)
+
+
+def _page() -> Writer:
     from nerfloom.export.run_page import export_page
     from nerfloom.registry import load_method
 
-    export_page(loaded, path, settings, load_method("gaussian-splatting"), regions)
+    splatting = load_method("gaussian-splatting")
+    return lambda loaded, path, settings, regions: export_page(loaded, path, settings, splatting, regions)
 
 
 KINDS: dict[str, Kind] = {
-    "pointcloud": Kind(PointSettings, (".ply",), _on_use("point_cloud.export_points"), is_cropped=True),
-    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _on_use("run_mesh.export_level_set"), is_cropped=True),
-    "tsdf": Kind(TsdfSettings, MESHES, _on_use("run_mesh.export_fused"), is_cropped=True),
-    "gaussian-splat": Kind(
-        SplatSettings, (".ply", ".spz", ".sog", ".glb"), _on_use("run_gaussians.export_gaussians"), is_cropped=True
-    ),
-    "levels": Kind(LevelsSettings, (".levels",), _on_use("run_levels.export_levels"), is_cropped=True),
-    "cameras": Kind(CameraSettings, (".json",), _on_use("run_cameras.export_cameras")),
-    "occupancy": Kind(OccupancySettings, (".npz",), _on_use("run_occupancy.export_occupancy")),
+    "pointcloud": Kind(PointSettings, (".ply",), _points, is_cropped=True),
+    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set, is_cropped=True),
+    "tsdf": Kind(TsdfSettings, MESHES, _fused, is_cropped=True),
+    "gaussian-splat": Kind(SplatSettings, (".ply", ".spz", ".sog", ".glb"), _gaussians, is_cropped=True),
+    "levels": Kind(LevelsSettings, (".levels",), _levels, is_cropped=True),
+    "cameras": Kind(CameraSettings, (".json",), _cameras),
+    "occupancy": Kind(OccupancySettings, (".npz",), _occupancy),
     "web": Kind(WebSettings, (".html",), _page, is_cropped=True),
 }
 """Kinds of export by name."""

@@ -31,8 +31,8 @@ class Closeness:
     method: float
     """PSNR against the method's own pictures, dB."""
     photographs: float | None
-    """PSNR against the photographs, dB; None if they are of other moments, or the page's scene cannot be drawn with
-    their lens."""
+    """PSNR against the photographs, dB; None if they are of other moments, or their lens cannot draw the page's
+    scene."""
     method_itself: float | None
     """PSNR of the method's own pictures against the photographs, dB; None likewise."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -26,7 +26,7 @@ class SurfacePoints:
     positions: Tensor
     """(K, 3) positions."""
     colors: Tensor
-    """(K, 3) colours in [0, 1], as seen from the respective camera."""
+    """(K, 3) colours in [0, 1], as seen from the respective camera, in the mean light of the images."""
     normals: Tensor | None
     """(K, 3) unit normals, if the method has them."""
     directions: Tensor
@@ -59,7 +59,7 @@ def surface_points(model: RendersRays, dataset: Dataset, count: int, reach: floa
         pixels = draw_pixels(dataset, min(chunk, count - start)).to(model.device)
         rays = dataset.cameras.pixel_rays(pixels, scene.near, scene.far, dataset.times)
         with model.rendering():
-            out = model.render(rays, background)
+            out = model.render(replace(rays, camera_indices=None), background)
         depth = out.median_depth.float()
         positions = rays.origins + depth[:, None] * rays.directions
         selected = (out.accumulation >= OPAQUE) & (depth < rays.fars) & _within(model, positions, reach)
@@ -89,7 +89,7 @@ def picture_points(model: Renderable, dataset: Dataset, count: int, reach: float
     background, far = model.background, model.scene.far
     views = torch.linspace(0, len(dataset) - 1, num_views(dataset), dtype=torch.float64).round().long().tolist()
     for number, index in enumerate(views):
-        view = dataset.view(index)
+        view = replace(dataset.view(index), image=None)
         picture = model.render_view(view, background)
         drawn = (number + 1) * count // len(views) - number * count // len(views)
         pixels = torch.randint(picture.depth.numel(), (drawn,), device=model.device)

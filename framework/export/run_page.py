@@ -39,6 +39,7 @@ from nerfloom.geometry.regions import Region
 from nerfloom.levels.drawn import DrawnLevels
 from nerfloom.method import Method
 from nerfloom.octrees.drawn import DrawnOctree, DrawsOctree
+from nerfloom.octrees.files import MAX_BYTES
 from nerfloom.octrees.octree import Octree
 from nerfloom.renderable import Renderable, RendersRays, with_refined_poses
 from nerfloom.scene.folded_poses import in_order
@@ -78,7 +79,7 @@ def export_page(
     start = start_of([names[index] for index in order], settings.start_view)
     ranks = shown_cameras(len(order), start)
     chosen = torch.tensor([order[rank] for rank in ranks])
-    turn = upright(cameras)
+    turn = upright(cameras, dataset is not None and dataset.z_is_up)
     red, green, blue = model.background.tolist()
     facts = PageFacts(
         title=_title(loaded) if settings.title is None else printable(settings.title),
@@ -123,7 +124,7 @@ def kind_of(model: Renderable) -> str:
     """Return the kind of the page of `model` if no setting says it, a key of `SCRIPTS`."""
     if isinstance(model, DrawnLevels):
         return "levels"
-    return "octree" if isinstance(model, DrawnOctree) else "gaussians"
+    return "octree" if isinstance(model, DrawsOctree) else "gaussians"
 
 
 def _check(settings: WebSettings, kind: str, model: Renderable, regions: Sequence[Region]) -> None:
@@ -187,18 +188,23 @@ def _gaussians(
     model = loaded.model
     if isinstance(model, HasGaussians):
         return model.gaussians(moment), model.look()
-    if not isinstance(model, RendersRays) or dataset is None:
+    if not isinstance(model, RendersRays):
         raise ConfigError(f"ns-export web: {loaded.method} has neither Gaussians nor rays, so it cannot be shown")
+    if dataset is None:
+        raise ConfigError("--kind gaussians: they are fitted at the cameras of photographs: give --data DIR")
     _check_seconds(seconds)
     return fit_gaussians(model, splatting, dataset, cameras, seconds, loaded.run.config.machine), OURS
 
 
 def _octree(loaded: Loaded, seconds: float, max_bytes: float) -> Octree:
-    """Return the octree of a file, or the octree of a field, which is baked; on the CPU."""
-    if isinstance(loaded.model, DrawnOctree):
-        return loaded.model.octree.to("cpu")
+    """Return a model's own octree, of any size, or the octree of a field, which is baked; on the CPU."""
+    model = loaded.model
+    if isinstance(model, DrawnOctree):
+        return model.octree.to("cpu")
+    if isinstance(model, DrawsOctree):
+        return bake(loaded, Baking(max_bytes=MAX_BYTES))  # the page makes it as small as asked
     _check_seconds(seconds)
-    if loaded.model.scene.unbounded and not isinstance(loaded.model, DrawsOctree):
+    if model.scene.unbounded:
         raise ConfigError(BEYOND_THE_BOX)
     return bake(loaded, Baking(max_bytes=max_bytes, seconds=seconds))
 
@@ -241,7 +247,7 @@ def _about(loaded: Loaded, kind: str, moment: float | None) -> str:
     parts = [f"Made by Nerfloom {made}."]
     if kind == "gaussians" and not isinstance(model, HasGaussians):
         parts.append(f"The Gaussians shown here are fitted to pictures of {method}'s field.")
-    if kind == "octree" and not isinstance(model, DrawnOctree):
+    if kind == "octree" and not isinstance(model, DrawsOctree):
         parts.append(f"The octree shown here is baked from {method}'s field.")
     if moment is not None:
         parts.append(f"The scene moves; this is time {moment:g}.")

@@ -75,8 +75,8 @@ class WebSettings:
     """A page that shows the scene's Gaussians or octree, or ones that are made from a field."""
 
     kind: PageKind | None = None
-    """Content of the page. octree: a run is baked, as by ns-bake; gaussians: they are fitted to a run without any.
-    Default: the octree of an octree's file, else Gaussians."""
+    """What the page shows. octree: a run is baked, as by ns-bake; gaussians: they are fitted to what has none. Default:
+    the octree of an octree's file or of a run of voxels, else Gaussians."""
     max_megabytes: float = 30.0
     """Maximum size of the page, MB (1e6 bytes), up to 32. Harmonics are reduced first, Gaussians or leaves last."""
     fit_seconds: float = 60.0

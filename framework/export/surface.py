@@ -38,6 +38,7 @@ def surface_mesh(
     resolution: int,
     low: tuple[float, float, float] | None = None,
     high: tuple[float, float, float] | None = None,
+    whole: bool = False,
 ) -> Mesh:
     """Return the surface of a model, as `ns-export` writes it with its defaults.
 
@@ -46,6 +47,7 @@ def surface_mesh(
         kind: the export.
         resolution: number of cells along the longest edge of the box.
         low, high: corners of a box to use instead of the scene's, in the frame and unit of the input.
+        whole: whether faces that no training camera sees stay in any case.
 
     Raises:
         ConfigError: if the model has no density, there is no surface, or it has no shape in space or time.
@@ -61,7 +63,8 @@ def surface_mesh(
     else:
         cameras = loaded.parsed("train").cameras
         if isinstance(model, HasSignedDistance):
-            mesh = distance_mesh(model, lattice, cameras, Cleaning(min_views=default_min_views(model)))
+            least = 0 if whole else default_min_views(model)
+            mesh = distance_mesh(model, lattice, cameras, Cleaning(min_views=least))
         else:
             mesh = density_mesh(model, lattice, default_level(model.scene.box), 0.0, cameras, Cleaning())
     return in_input(mesh, loaded.placement)

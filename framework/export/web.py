@@ -105,17 +105,19 @@ class PageFacts:
         return "levels" if self.levels else "gaussians" if self.look else "octree"
 
 
-def upright(cameras: Cameras) -> Tensor:
+def upright(cameras: Cameras, z_is_up: bool) -> Tensor:
     """Return the rotation (3, 3), float64, of the cameras' mean up direction to z.
 
     It is the identity if z is up already, or if the cameras are turned in all directions.
 
     Args:
         cameras: M cameras.
+        z_is_up: whether z is known to be up, wherever the cameras' up is: they may look straight down, or lie on their
+            side.
     """
     up = cameras.camera_to_worlds[:, :, 1].double().mean(0).cpu()
     z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    if float(up.norm()) < LEVEL or float(up[2]) >= LEVEL * float(up.norm()):
+    if z_is_up or float(up.norm()) < LEVEL or float(up[2]) >= LEVEL * float(up.norm()):
         return torch.eye(3, dtype=torch.float64)
     return rotation_between(up, z)
 

@@ -198,10 +198,10 @@ class GridDistance(Distance):
 class NetworkDistance(Distance):
     """The network of IDR (Yariv et al. 2020), NeuS and VolSDF: softplus, a skip connection, and a ball to start from.
 
-    The first weights follow SAL (Atzmon and Lipman 2020): a network of infinite width is then the distance to a ball.
-    One of 256 features is off by a seventh of the radius, which differs from direction to direction. So the
-    weights of the output are then fitted to the ball by least squares. Halfway through the hidden layers, the encoded
-    position is concatenated again.
+    The first weights are those of SAL (Atzmon and Lipman 2020), which make a network of endless width the distance of a
+    ball. One of 256 features is off by a seventh of the radius, differently in each direction. So the weights of the
+    output are then fitted to the ball by least squares. Halfway through the hidden layers, the encoded position is
+    concatenated again.
 
     Args:
         box: (2, 3) corners of the box, scene units.

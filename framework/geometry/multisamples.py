@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from nerfloom.geometry.points import Frustums, frames
+from nerfloom.geometry.points import Frustums, frames, radii_at
 
 THIRDS_OF_PI = (0, 2, 4, 3, 5, 1)
 """Angle of each point around the axis, from the near end to the far one, in units of pi / 3."""
@@ -81,12 +81,14 @@ def multisamples(frustums: Frustums, pattern: Pattern) -> tuple[Tensor, Tensor]:
     middle, half = (start + end) / 2, (end - start) / 2
     positive = middle > 0
     share = torch.where(positive, half / torch.where(positive, middle, torch.ones_like(middle)), 0.0)
+    if frustums.parallel:  # the apex is infinitely far away
+        share = torch.zeros_like(share)
     squared = share.square()
     along = torch.linspace(-1, 1, NUM_MULTISAMPLES, dtype=start.dtype, device=start.device)
     spread = (3 / math.sqrt(7)) * along * ((squared - 1).square() + 4).sqrt()
     t = start + half * ((1 + share).square() + 2 + spread) / (squared + 3)
     angles = _angles(along.dtype, along.device) + pattern.turns[:, None]
-    away = frustums.radii[:, None] * t / math.sqrt(2)
+    away = radii_at(t, frustums.radii[:, None], frustums.parallel).expand_as(t) / math.sqrt(2)
     _, first, second = frames(frustums.directions).unbind(-1)
     positions = torch.addcmul(frustums.origins[:, None], t[..., None], frustums.directions[:, None])
     positions = torch.addcmul(positions, (away * angles.cos())[..., None], first[:, None])

@@ -17,20 +17,22 @@ or the interval itself."""
 
 @dataclass(frozen=True)
 class Frustums:
-    """N conical frustums: intervals of the cones around rays."""
+    """N conical frustums: intervals of the cones around rays, or of the cylinders around parallel rays."""
 
     origins: Tensor
-    """(N, 3) apex of each cone, scene coordinates."""
+    """(N, 3) apex of each cone, or origin of the ray in each cylinder, scene coordinates."""
     directions: Tensor
     """(N, 3) unit direction of each cone's axis."""
     t_starts: Tensor
-    """(N,) distance from the apex where the frustum starts."""
+    """(N,) distance from the origin where the frustum starts."""
     t_ends: Tensor
-    """(N,) distance from the apex where the frustum ends."""
+    """(N,) distance from the origin where the frustum ends."""
     radii: Tensor
-    """(N,) radius of the cone at distance 1."""
+    """(N,) radius of the cone at distance 1, or of the cylinder."""
     ranks: Tensor | None = None
     """(N,) number of intervals in front of each on its ray, if known."""
+    parallel: bool = False
+    """Whether they are cylinders."""
 
     def __len__(self) -> int:
         return self.t_starts.shape[0]
@@ -143,33 +145,51 @@ def interval_points(
     radii = rays.pixel_radii.index_select(0, owners)
     if footprint == "radius":
         points = rays.points(owners, intervals.t) if positions is None else positions
-        return Points(points, times, intervals.t * radii)
+        return Points(points, times, radii_at(intervals.t, radii, rays.parallel))
     if footprint == "frustum":
         origins, directions = (x.index_select(0, owners) for x in (rays.origins, rays.directions))
         if positions is None:
             positions = torch.addcmul(origins, directions, intervals.t[:, None])
-        frustums = Frustums(origins, directions, intervals.t_starts, intervals.t_ends, radii, ranks)
-        return Points(positions, times, intervals.t * radii, frustums=frustums)
-    mean_t, along, across = conical_frustums(intervals.t_starts, intervals.t_ends, radii)
+        frustums = Frustums(origins, directions, intervals.t_starts, intervals.t_ends, radii, ranks, rays.parallel)
+        return Points(positions, times, radii_at(intervals.t, radii, rays.parallel), frustums=frustums)
+    mean_t, along, across = conical_frustums(intervals.t_starts, intervals.t_ends, radii, rays.parallel)
     axes = rays.directions.index_select(0, owners)
     squared = axes.square()
     covariances = along[:, None] * squared + across[:, None] * (1 - squared)
     variances = torch.stack([along, across], dim=-1)
-    return Points(rays.points(owners, mean_t), times, mean_t * radii, covariances, axes, variances)
+    return Points(
+        rays.points(owners, mean_t), times, radii_at(mean_t, radii, rays.parallel), covariances, axes, variances
+    )
 
 
-def conical_frustums(t_starts: Tensor, t_ends: Tensor, radii: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def radii_at(t: Tensor, radii: Tensor, parallel: bool) -> Tensor:
+    """Return the radius (N,) of pixels at distances `t` (N,) along rays.
+
+    Args:
+        t: distances.
+        radii: (N,) `Rays.pixel_radii` of the rays.
+        parallel: `Rays.parallel`.
+    """
+    return radii if parallel else t * radii
+
+
+def conical_frustums(
+    t_starts: Tensor, t_ends: Tensor, radii: Tensor, parallel: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the Gaussians of conical frustums: Mip-NeRF (Barron et al. 2021), equation 7, in its stable form.
 
     Args:
         t_starts: (N,) distance where each frustum starts.
         t_ends: (N,) distance where each frustum ends.
-        radii: (N,) radius of the cone at distance 1.
+        radii: (N,) radius of the cone at distance 1, or of the cylinder.
+        parallel: whether they are cylinders.
 
     Returns:
         (N,) mean distance, (N,) variance along the ray, and (N,) variance perpendicular to the ray.
     """
     middle, half = (t_starts + t_ends) / 2, (t_ends - t_starts) / 2
+    if parallel:
+        return middle, half.square() / 3, radii.square() / 4
     # Written in half / middle, which is at most 1: half^4 overflows for the last interval, which is very long.
     positive = middle > 0
     squared = torch.where(positive, half / torch.where(positive, middle, torch.ones_like(middle)), 0.0).square()

@@ -17,7 +17,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Rays:
-    """A batch of R rays. Every field is indexed by ray; optional fields are None if unknown."""
+    """A batch of R rays. Every tensor is indexed by ray; optional ones are None if unknown."""
 
     origins: Tensor
     """(R, 3) origins, scene units."""
@@ -28,13 +28,15 @@ class Rays:
     fars: Tensor = None  # type: ignore[assignment]
     """(R,) distance where sampling ends; if not given infinite, for samplers that end with a box."""
     pixel_radii: Tensor | None = None
-    """(R,) radius of the pixel's cone at distance 1 (Mip-NeRF, section 3.1)."""
+    """(R,) radius of the pixel's cone at distance 1 (Mip-NeRF, section 3.1); at all distances if `parallel`."""
     times: Tensor | None = None
     """(R,) time in [0, 1] of a moving scene."""
     camera_indices: Tensor | None = None
     """(R,) index of the training camera."""
     places: Tensor | None = None
     """(R, 2) position in the camera's image from its left and top edge, 0 to 1 (`Cameras.places`)."""
+    parallel: bool = False
+    """Whether neighbouring rays are parallel (orthographic cameras), so that pixels are as wide at all distances."""
 
     def __post_init__(self) -> None:
         for name, value in (("nears", 0.0), ("fars", torch.inf)):
@@ -57,9 +59,10 @@ class Rays:
         return self._map(lambda values: values.detach())
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Rays:
-        """Apply a function to every field that is not None."""
-        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: change(values) for name, values in tensors.items() if values is not None})
+        """Apply a function to every tensor."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {name: change(value) for name, value in values.items() if isinstance(value, Tensor)}
+        return replace(self, **changed)
 
     def points(self, ray_indices: Tensor, t: Tensor) -> Tensor:
         """Return positions along rays.

@@ -26,7 +26,7 @@ from nerfloom.base.errors import CheckpointError, ConfigError
 from nerfloom.base.json_files import write_json
 from nerfloom.base.plain import from_plain, to_plain
 from nerfloom.cameras.view import View
-from nerfloom.evaluation.appearance import appearance_of, fit_appearance, shown_appearance
+from nerfloom.evaluation.appearance import fit_appearance, shown_appearance
 from nerfloom.integrations.nerfbaselines_data import (
     CAMERA_MODELS,
     ArrayImages,
@@ -179,7 +179,7 @@ class NerfloomMethod:
 
     def get_train_embedding(self, index: int) -> np.ndarray | None:
         """(D,) the appearance of training photograph `index`; None for methods without appearance."""
-        appearance = appearance_of(self._model)
+        appearance = self._model.appearance
         return None if appearance is None else appearance.of_images()[index].detach().cpu().numpy()
 
     def optimize_embedding(self, dataset: DatasetDict, *, embedding: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -195,7 +195,7 @@ class NerfloomMethod:
         Raises:
             NotImplementedError: for a method without appearance, as nerfbaselines expects.
         """
-        if appearance_of(self._model) is None:
+        if self._model.appearance is None:
             raise NotImplementedError(f"{self.name} has learnt one appearance for all photographs")
         data = dataset_of(ArrayImages.of(dataset), self._frame, "ignored").to(self._model.device)
         data = replace(data, cameras=refined_cameras(self._model, data.cameras, training=False))

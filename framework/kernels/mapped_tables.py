@@ -34,6 +34,8 @@ class MappedTables(Tables):
         folder: folder of the files, created if missing. It should be on a disk, not in memory.
     """
 
+    in_files = True
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._maps: WeakSet[mmap.mmap] = WeakSet()

@@ -82,6 +82,9 @@ def page_out(values: Tensor) -> None:
 class Tables:
     """The place of tables and of their optimiser's state: memory. `mapped_tables.MappedTables` keeps them in files."""
 
+    in_files: bool = False
+    """Whether tables are in files, so that they may be larger than memory."""
+
     def zeros(self, *shape: int, like: Tensor) -> Tensor:
         """Return a new table of zeros.
 

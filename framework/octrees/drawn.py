@@ -111,9 +111,7 @@ class DrawsOctree(RendersRays):
         with self.rendering():
             for some in pixels.reshape(-1).split(max(self.rays_at_once // per_pixel, 1)):
                 rays = view.camera.pixel_rays(some, self.scene.near, self.scene.far, None, offsets)
-                radii = rays.pixel_radii
-                if radii is not None:  # the width of a pixel of parallel rays does not grow with the distance
-                    radii = None if view.camera.model == "orthographic" else radii / per_pixel**0.5
+                radii = None if rays.pixel_radii is None else rays.pixel_radii / per_pixel**0.5
                 rendered = self.render(replace(rays, camera_indices=None, pixel_radii=radii), background)
                 parts.append(rendered.to_pixels(per_pixel, self.outputs))
         size = tuple(pixels.shape)

@@ -1,6 +1,6 @@
 """Files of octrees, NAME.octree: a .npz archive (a zip file of plain arrays), compressed.
 
-    version                1
+    version                2; 1 had a single box, and no array `bricks`
     size                   (3,) bricks along each axis
     origin, cell           corner of the first cell, and a cell's edge, scene units
     bricks                 (V,) number of bricks with leaves in each of V boxes; each box has the same centre, twice the
@@ -41,7 +41,7 @@ from nerfloom.octrees.octree import Octree
 
 SUFFIX = ".octree"
 """Suffix of the files."""
-VERSION = 1
+VERSION = 2
 """Version of the format."""
 MAX_SIDE = 2**16
 """Maximum number of bricks along an axis: their coordinates are stored in 16 bits."""
@@ -103,7 +103,7 @@ def read_octree(file: Path) -> Octree:
         file: path of the file.
 
     Raises:
-        DataError: if the file cannot be read, is damaged, or is something else.
+        DataError: if the file cannot be read, is damaged, has another version, or is something else.
     """
     try:
         arrays = _arrays(file)
@@ -121,12 +121,13 @@ def _arrays(file: Path) -> dict[str, np.ndarray]:
     if expected > min(MAX_BYTES, MAX_RATIO * file.stat().st_size):
         raise ValueError(f"it claims to hold {expected:,} bytes")
     arrays = read_small_arrays(file, NAMES.__contains__, expected)
+    # The version comes first: others have other arrays.
+    version = _number(arrays, "version", 0, 1e6) if "version" in arrays else VERSION
+    if version != VERSION:
+        raise DataError(f"{file} has version {version:g} of the format, and {VERSION} is known; bake it again")
     missing = [name for name in NAMES if name not in arrays]
     if missing:
         raise ValueError(f"it has no array '{missing[0]}'")
-    version = _number(arrays, "version", 0, 1e6)
-    if version != VERSION:
-        raise ValueError(f"it has version {version:g} of the format; only version {VERSION} is supported")
     return arrays
 
 

@@ -7,6 +7,9 @@ from torch import Tensor
 
 from nerfloom.kernels.octree.layout import OctreeLayout
 
+UNMET = -1.0
+"""Largest weight of a leaf that no ray has met and that stays, because nothing is known of it."""
+
 
 def moments(num_splits: int) -> list[tuple[float, bool]]:
     """Return when leaves change: spent shares of the budget, each with whether leaves are split or only dropped.
@@ -30,12 +33,12 @@ def visible(peaks: Tensor, least: float, most: int) -> Tensor:
     A ray over colours in [0, 1] changes by at most the sum of the weights that the dropped leaves have on it.
 
     Args:
-        peaks: (L,) largest weight of each leaf on training rays.
-        least: smallest weight of a leaf that stays. If no leaf has it, nothing is known yet, and all qualify.
-        most: maximum number of leaves; the ones with the largest weights stay.
+        peaks: (L,) largest weight of each leaf on training rays, or `UNMET`, with which it stays.
+        least: smallest weight of a visible leaf. If no leaf has it, nothing is known yet, and all qualify.
+        most: maximum number of leaves; those with the largest weights stay.
     """
-    kept = (peaks >= least).nonzero()[:, 0]
-    kept = kept if len(kept) else torch.arange(len(peaks), device=peaks.device)
+    seen = peaks >= least
+    kept = (seen | (peaks < 0) | ~seen.any()).nonzero()[:, 0]
     return kept if len(kept) <= most else kept[peaks[kept].topk(most).indices].sort().values
 
 

@@ -14,9 +14,11 @@ from __future__ import annotations
 
 import csv
 import gzip
+import io
 import json
 import re
 import zlib
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -25,6 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nerfloom.base.console import track_bytes
 from nerfloom.base.errors import DataError
 from nerfloom.processing.aria_lens import MODEL, NAMES
 from nerfloom.processing.capture import Capture, PosedCamera, camera_pose
@@ -32,6 +35,7 @@ from nerfloom.processing.finite_numbers import UNUSABLE, bounded, finite_array
 from nerfloom.processing.listing import find_images
 from nerfloom.processing.phone import evenly_spaced
 from nerfloom.processing.point_files import GREY, MAX_POINTS
+from nerfloom.processing.record3d import rotations
 from nerfloom.processing.transforms import Lens
 
 PROGRAM = "Aria"
@@ -55,6 +59,8 @@ POINT = ("px_world", "py_world", "pz_world")
 """Columns of a point."""
 DEVIATIONS = {"inv_dist_std": 0.005, "dist_std": 0.01}
 """Columns of a point's standard deviations, and the maxima that MPS's documentation recommends, 1/m and m."""
+LINES_OF_PROGRESS = 10_000
+"""Number of lines of a table between two reports of progress."""
 LEVEL = 0.9998
 """Minimum cosine between z and the direction against gravity for z to be up."""
 
@@ -248,30 +254,35 @@ def _points(results: Path, graph: str) -> np.ndarray | None:
         file = _found(results, "semidense_points.csv.gz")
     except DataError:
         return None
-    kept = []
+    kept = array("d")  # a recording has millions of points
     for number, (own, *values) in _table(file, ("graph_uid", *POINT, *DEVIATIONS)):
         try:
             row = [bounded(value) for value in values]
         except UNUSABLE as error:
             raise DataError(f"{file}: line {number}: a column is not a number") from error
         if own == graph and all(value <= most for value, most in zip(row[3:], DEVIATIONS.values(), strict=True)):
-            kept.append(row[:3])
-    every = -(-len(kept) // MAX_POINTS) or 1
-    return np.array(kept[::every], np.float64).reshape(-1, 3) if kept else None
+            kept.extend(row[:3])
+    points = np.array(kept).reshape(-1, 3)
+    every = -(-len(points) // MAX_POINTS)
+    return points[::every] if every else None
 
 
 def _table(file: Path, columns: Sequence[str]) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of each line of a CSV file, which may be compressed by gzip, and its values of some columns."""
     try:
-        opened: Any = gzip.open if file.suffix == ".gz" else open
-        with opened(file, "rt", encoding="utf-8-sig", newline="") as stream:
-            rows = csv.reader(stream)
+        with file.open("rb") as raw, track_bytes(f"Reading {file.name}", file.stat().st_size) as advance:
+            content: Any = gzip.GzipFile(fileobj=raw) if file.suffix == ".gz" else raw
+            rows = csv.reader(io.TextIOWrapper(content, encoding="utf-8-sig", newline=""))
             header = next(rows, [])
             missing = [name for name in columns if name not in header]
             if missing:
                 raise DataError(f"{file} has no column {missing[0]}; it must be as MPS writes it")
             places = [header.index(name) for name in columns]
+            done = 0
             for number, row in enumerate(rows, 2):
+                if number % LINES_OF_PROGRESS == 0:
+                    advance(raw.tell() - done)
+                    done = raw.tell()
                 if row and len(row) < len(header):
                     raise DataError(f"{file}: line {number} has {len(row)} values, and the header {len(header)}")
                 if row:
@@ -297,11 +308,4 @@ def _rotation(quaternion: np.ndarray, what: str) -> np.ndarray:
     length = float(np.linalg.norm(quaternion))
     if not 0.5 < length < 2:
         raise DataError(f"{what} has a quaternion that is not of unit length")
-    x, y, z, w = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotations(quaternion[None] / length)[0]

@@ -34,7 +34,7 @@ def project(directions: np.ndarray, values: dict[str, float]) -> tuple[np.ndarra
 
     Returns:
         q, x to the right and y down, (N,) each, in focal lengths from the principal point; and (N,) bool, whether the
-        radial polynomial grows up to the angle.
+        radial polynomial grows up to this angle.
     """
     right, down, ahead = directions[:, 0], -directions[:, 1], -directions[:, 2]
     across = np.hypot(right, down)
@@ -54,7 +54,7 @@ def project(directions: np.ndarray, values: dict[str, float]) -> tuple[np.ndarra
 
 
 def reach(values: dict[str, float]) -> float:
-    """Return the largest angle from the axis, radians, with a growing radial polynomial up to it; pi at most.
+    """Return the largest angle from the axis, radians, where the radial polynomial still grows; pi at most.
 
     Args:
         values: coefficients by their names.

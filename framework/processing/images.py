@@ -129,7 +129,7 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
     """
     path, target = folder / source, images / name
     target.parent.mkdir(parents=True, exist_ok=True)
-    read_heif(path)
+    read_heif()
     try:
         with Image.open(Content(path)) as image:
             image.load()  # a truncated file fails here

@@ -13,6 +13,7 @@ from nerfloom.base.device import choose_device
 from nerfloom.base.json_files import read_object, write_json
 from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import load_dataset
+from nerfloom.data.image_files import image_size
 from nerfloom.data.pixels.device_placement import on_device
 from nerfloom.data.pixels.left_out import LeftOutTiles
 from nerfloom.data.sources import SCOUTED_ALONG
@@ -31,7 +32,7 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
     """Train a scout on a finished data folder, and add masks that leave out moving things.
 
     Masks are black where something moves. They have full size, with reduced copies beside them. transforms.json names
-    them, so any tool that reads masks can use them.
+    them, so any tool that reads masks can use them. An image that cannot be read has none.
 
     Args:
         output: folder with transforms.json and images.
@@ -40,8 +41,7 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
     """
     content = read_object(output / FINISHED)
     frames = {Path(frame["file_path"]).relative_to("images").as_posix(): frame for frame in content["frames"]}
-    with Image.open(output / "images" / next(iter(frames))) as image:
-        longer = max(image.size)
+    longer = max(image_size([output / "images" / name for name in frames]))
     factor = max(2**level for level in range(min(num_downscales, 3) + 1) if longer >> level >= LONGER_SIDE or not level)
     parser = load_dataparser("nerfstudio")
     parsed = from_plain(parser(), {"eval_mode": "all", "downscale_factor": factor}, "masks").parse(output, "train")
@@ -50,18 +50,16 @@ def mask_moving(output: Path, num_downscales: int, **settings: Any) -> None:
     found = LeftOutTiles(dataset, SCOUTED_ALONG)
     scout(Trainer, dataset, found, config, **{"max_num_iterations": None, **settings})
     names, share = [], 0.0
-    for index, path in enumerate(parsed.image_paths):
+    for index, path in enumerate(dataset.paths):
         counting = 1 - found.tiles.over_image(found.left_out, index)
         name = Path(*path.relative_to(output).parts[1:]).as_posix()
-        with Image.open(output / "images" / name) as image:
-            size = image.size
         grey = Image.fromarray((counting.cpu().numpy() * 255).astype("uint8"))
         target = output / "masks" / f"{name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
-        save(grey.resize(size, Image.Resampling.NEAREST), target)
+        save(grey.resize(image_size([output / "images" / name]), Image.Resampling.NEAREST), target)
         frames[name]["mask_path"] = f"masks/{name}.png"
         names.append(f"{name}.png")
-        share += float(1 - counting.mean()) / len(parsed.image_paths)
+        share += float(1 - counting.mean()) / len(dataset)
     write_pyramid(output / "masks", names, num_downscales, masks=True)
     write_json(output / FINISHED, content)
     say(f"masks leave out {share:.1%} of all pixels; look at {output / 'masks'} before you train with them")

@@ -53,7 +53,7 @@ def write_views(folder: Path, sources: list[Path], work: Path, views: Views) -> 
     names = view_names([image.name for image in prepared], len(views.directions))
 
     def cut_one(index: int) -> None:
-        for view in cut(_pixels(whole / prepared[index].name), panorama_lens(prepared[index]), views):
+        for view in cut(pixels_of(whole / prepared[index].name), panorama_lens(prepared[index]), views):
             path = partial / names[index][view.number]
             path.parent.mkdir(parents=True, exist_ok=True)
             save(Image.fromarray(view.pixels), path)
@@ -66,11 +66,14 @@ def write_views(folder: Path, sources: list[Path], work: Path, views: Views) -> 
     return target, _in_order(Path(name) for each in names for name in each)
 
 
-def view_names(names: Sequence[str], count: int) -> list[list[str]]:
-    """Return the names of `count` views of each panorama in `names`."""
-    made = output_names(
-        Path(name).with_name(f"view_{number}_{Path(name).name}") for name in names for number in range(count)
-    )
+def view_names(names: Sequence[str], count: int, taken: Sequence[str] = ()) -> list[list[str]]:
+    """Return names, different from those `taken`, for `count` views of each image in `names`.
+
+    Views of one direction follow each other: every eighth image by name is held out, and of eight views of each image
+    that would always be the first, so that no image showed what is ahead.
+    """
+    views = [Path(name).with_name(f"view_{number}_{Path(name).name}") for name in names for number in range(count)]
+    made = output_names([*map(Path, taken), *views])[len(taken) :]
     return [made[start : start + count] for start in range(0, len(made), count)]
 
 
@@ -91,6 +94,7 @@ def _in_order(paths: Iterable[Path]) -> list[Path]:
     return sorted(paths, key=natural_order)
 
 
-def _pixels(path: Path) -> np.ndarray:
+def pixels_of(path: Path) -> np.ndarray:
+    """Return the pixels (H, W, 3 or 4) uint8 of the image `path`."""
     with Image.open(path) as opened:
         return np.asarray(opened.convert("RGBA" if "A" in opened.getbands() else "RGB"))

@@ -69,8 +69,8 @@ def write_folder(
     Raises:
         DataError: if no image is readable, an image and its lens differ in shape, or points cannot be used.
     """
-    cameras = [PosedCamera(name.as_posix(), pose, for_size_of(lens)) for name, (pose, lens) in posed.items()]
-    # Distances are compared, which are the same before and after a turn of the frame.
+    back = np.linalg.inv(np.vstack([applied, [0, 0, 0, 1]]))  # the points are in the phone's frame
+    cameras = [PosedCamera(name.as_posix(), back @ pose, for_size_of(lens)) for name, (pose, lens) in posed.items()]
     cloud = with_points(Capture("the phone", cameras, Counter()), points)
     prepared, _ = prepare_all(folder, list(posed), output / "images", upright=False, crop=crop)
     frames = []

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -16,9 +16,10 @@ from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import write_json
 from nerfloom.processing import aria_lens
 from nerfloom.processing.capture import Capture, PosedCamera
-from nerfloom.processing.images import PreparedImage, in_parallel, output_names, prepare_all, save
+from nerfloom.processing.images import PreparedImage, in_parallel, prepare_all, save
 from nerfloom.processing.named_images import PlacedImages, reasons
 from nerfloom.processing.output import FINISHED, ready
+from nerfloom.processing.panoramas import pixels_of, view_names
 from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.processing.transforms import POINTS, Frame, Lens, content, transformed, write_points
 from nerfloom.processing.views import View, Views, cut, view_lens
@@ -119,7 +120,8 @@ def _frames(posed: list[_Posed], models: set[str], views: Views, output: Path) -
     frames = [Frame(entry.image.name, entry.pose, entry.lens, source=entry.image.source) for entry in kept]
     if not wide:
         return frames
-    names = _view_names([entry.image.name for entry in posed], wide, views)
+    taken = [entry.image.name for entry in posed]
+    names = view_names([entry.image.name for entry in wide], len(views.directions), taken)
 
     def cut_one(index: int) -> list[Frame]:
         return _cut(wide[index], names[index], views, output)
@@ -131,28 +133,12 @@ def _frames(posed: list[_Posed], models: set[str], views: Views, output: Path) -
     return [*frames, *made]
 
 
-def _view_names(taken: list[str], wide: list[_Posed], views: Views) -> list[list[str]]:
-    """Return a name for each view of each image, different from the names that are taken.
-
-    Views of one direction follow each other, as in `panoramas.view_names`: every eighth image by name is held out, and
-    with eight views of each image the first would always be held out, so that no image showed this direction.
-    """
-    count = len(views.directions)
-    wanted = [Path(name) for name in taken]
-    for entry in wide:
-        path = PurePosixPath(entry.image.name)
-        wanted += [Path(path.with_name(f"view_{number}_{path.name}")) for number in range(count)]
-    names = output_names(wanted)[len(taken) :]
-    return [names[start : start + count] for start in range(0, len(names), count)]
-
-
 def _cut(entry: _Posed, names: list[str], views: Views, output: Path) -> list[Frame]:
     """Write the views of an image, with masks where they reach beyond it, and remove the image."""
     path = output / "images" / entry.image.name
-    with Image.open(path) as opened:
-        pixels = np.asarray(opened.convert("RGBA" if "A" in opened.getbands() else "RGB"))
     lens = view_lens(entry.lens, views.angle)
-    frames = [_write_view(view, names[view.number], entry, lens, output) for view in cut(pixels, entry.lens, views)]
+    made = cut(pixels_of(path), entry.lens, views)
+    frames = [_write_view(view, names[view.number], entry, lens, output) for view in made]
     path.unlink()
     return frames
 

@@ -93,6 +93,6 @@ def _centers(count: int, like: Tensor) -> Tensor:
 
 
 def _hats(positions: Tensor, count: int) -> Tensor:
-    """Return the weights (..., count) of all vertices at positions (...) in [0, 1]; at most two are not 0."""
+    """Return the weights (..., count) of all vertices at positions (...) in [0, 1]; at most two of them are not 0."""
     vertices = torch.arange(count, dtype=positions.dtype, device=positions.device)
     return (1 - (positions.clamp(0, 1)[..., None] * (count - 1) - vertices).abs()).clamp(min=0)

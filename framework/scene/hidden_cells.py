@@ -1,7 +1,8 @@
 """Space that images show but no training ray reaches, found during training: the inside of things, and the ground.
 
 A ray has samples in occupied cells until hardly any of its light is left. So an occupied cell within the frames of the
-images that has no samples lies behind a surface. Space beside all frames is not hidden: nothing stands before it.
+images that has no samples lies behind a surface. Space beside all frames is not hidden: nothing stands before it. Nor
+is space outside the sphere where the rays' samples end: the background shows it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 
 from nerfloom.base.processes import add_up
 from nerfloom.cameras.cameras import Cameras
+from nerfloom.geometry.bounds import cell_corners
 from nerfloom.kernels.march.occupancy import Occupancy, dilated
 from nerfloom.kernels.native import torch_on_one_thread
 from nerfloom.scene.covisible_space import times_seen
@@ -36,7 +38,7 @@ class HiddenCells(nn.Module):
 
     box: Tensor
     shown: Tensor
-    """(n^3,) bool, cells within the frames of enough images."""
+    """(n^3,) bool, cells in the sphere, within the frames of enough images."""
     reached: Tensor
     """(n^3 + 1,) bool, cells with samples since the last period; the last entry stands for no cell."""
     hidden: Tensor
@@ -51,17 +53,21 @@ class HiddenCells(nn.Module):
         self.register_buffer("hidden", none[:-1].clone())
 
     @torch.no_grad()
-    def show(self, cameras: Cameras, nearest: Tensor, least: int) -> None:
-        """Find the cells that at least `least` images show, or all images if there are fewer.
+    def show(self, cameras: Cameras, nearest: Tensor, least: int, sphere: Tensor) -> None:
+        """Find the cells in the sphere that at least `least` images show, or all images if there are fewer.
 
         Args:
             cameras: M training cameras.
             nearest: (M,) distance of each camera that its image shows to be empty, scene units.
             least: minimum number of images, at least 1.
+            sphere: (4,) centre and radius of the sphere that has the rays' samples, scene units.
         """
-        least = min(least, len(cameras))
+        least, sphere = min(least, len(cameras)), sphere.to(self.box)
+        corners = cell_corners(torch.arange(CELLS**3, device=self.box.device), CELLS)
+        middles = torch.lerp(self.box[0], self.box[1], (corners + 0.5) / CELLS)
+        inside = (middles - sphere[:3]).norm(dim=-1) <= sphere[3]
         with torch_on_one_thread():  # the operations are small
-            self.shown.copy_(times_seen(cameras, nearest, self.box, CELLS, least) >= least)
+            self.shown.copy_((times_seen(cameras, nearest, self.box, CELLS, least) >= least) & inside)
 
     def note(self, positions: Tensor, lengths: Tensor) -> None:
         """Note samples of a training step.

@@ -104,8 +104,8 @@ def ball_dataset(positions: Tensor, field_of_view: float) -> Dataset:
         image_size=SIZE,
         camera_to_worlds=cameras.camera_to_worlds,
     )
-    names = tuple(f"ball_{index:02d}.png" for index in range(len(cameras)))
-    return Dataset(pixels, cameras, None, names, scene, torch.eye(4)[:3], 1.0)
+    paths = tuple(Path(f"ball_{index:02d}.png") for index in range(len(cameras)))
+    return Dataset(pixels, cameras, None, paths, scene, torch.eye(4)[:3], 1.0)
 
 
 def photograph(cameras: Cameras) -> Tensor:

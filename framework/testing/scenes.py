@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -83,7 +84,7 @@ def _dataset(colors: Tensor, size: int, times: Tensor | None = None, unbounded: 
         pixels=(colors * 255).round().to(torch.uint8),
         cameras=cameras,
         times=times,
-        names=tuple(f"{index}.png" for index in range(COUNT)),
+        paths=tuple(Path(f"{index}.png") for index in range(COUNT)),
         scene=scene,
         transform=torch.eye(4, dtype=torch.float64)[:3],
         scale=1.0,

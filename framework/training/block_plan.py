@@ -3,7 +3,8 @@
 FOLDER/
     plan.json                     method, flags and cameras of each block, so that a later call continues
     dataparser_transforms.json    from the input's frame to the composed scene's
-    runs/000/placement.json       from the input's frame to block 0's, if the format takes a placement
+    runs/000/recipe.json          method and images of block 0: their list may be too long for a command
+    runs/000/placement.json       from the input's frame to that of block 0, if the format takes a placement
     runs/000/METHOD/run/          the run of block 0
     blocks.yml                    the scene in blocks
 """
@@ -75,7 +76,7 @@ class BlockPlan:
         ]
 
     def claim_folder(self, placement: Placement) -> None:
-        """Write the plan and all placements, with the composed scene's `placement`, so that a later call continues.
+        """Write the plan and what its jobs read, with the composed scene's `placement`, so that a later call continues.
 
         Raises:
             ConfigError: if the folder has other blocks, or cannot be written.
@@ -90,8 +91,10 @@ class BlockPlan:
                     "choose another --output-dir"
                 )
         try:
-            for number, own in enumerate(self.placements):
+            for number, (block, own) in enumerate(zip(self.blocks, self.placements, strict=True)):
                 self._home(number).mkdir(parents=True, exist_ok=True)
+                recipe = {"method": self.method, "train_image_indices": list(block.cameras)}
+                write_json(self._recipe(number), recipe)
                 if own is not None:
                     write_json(self._home(number) / "placement.json", _plain(own))
             write_json(self.folder / TRANSFORMS, _plain(placement))
@@ -101,6 +104,9 @@ class BlockPlan:
 
     def _home(self, number: int) -> Path:
         return self.folder / "runs" / f"{number:03d}"
+
+    def _recipe(self, number: int) -> Path:
+        return self._home(number) / "recipe.json"
 
     def _as_plain(self) -> dict[str, Any]:
         cameras = [list(block.cameras) for block in self.blocks]
@@ -112,10 +118,10 @@ class BlockPlan:
         own = ["--output-dir", str(self.folder / "runs"), "--experiment-name", f"{number:03d}", "--timestamp", run.name]
         if self.placements[number] is not None:
             own += ["--placement", str(self._home(number) / "placement.json")]
-        own += ["--train-image-indices", *map(str, block.cameras)]
         device = ["--machine.device-type", self.device_type]
-        # The last of two equal flags counts.
-        command = [*python_command("nerfloom.cli.train", self.method), *ALONE, *device, *threads, *self.flags, *own]
+        recipe = ["--load-config", str(self._recipe(number))]
+        # Of two equal flags the last counts.
+        command = [*python_command("nerfloom.cli.train", *recipe), *ALONE, *device, *threads, *self.flags, *own]
         resume = python_command("nerfloom.cli.train", "--resume", run)
         return Job(
             title=f"block {number:03d}",

@@ -23,7 +23,7 @@ from nerfloom.training.trained import load_trained
 MAX_SIGHTS = 128
 """Maximum number of training images that are rendered."""
 SIDE = 48
-"""Longer side of their pictures, pixels, at most twice this."""
+"""Minimum length of the longer side of their pictures, pixels. It is less than twice this."""
 POINTS = 2**16
 """Number of points to learn from."""
 STEPS, BATCH, RATE = 500, 4096, 5e-3
@@ -68,7 +68,7 @@ def fitted(network: Visibility, points: Tensor, directions: Tensor, labels: Tens
     Args:
         network: a new network.
         points: (N, 3) positions in the input's frame.
-        directions: (N, 3) unit viewing directions, in the input's frame.
+        directions: (N, 3) unit directions from a camera to each point, in the input's frame.
         labels: (N,) their transmittances.
     """
     inputs, random = network.inputs(points, directions), torch.Generator().manual_seed(0)

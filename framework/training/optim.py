@@ -247,10 +247,13 @@ def make_optimizer(model: Model[Any], config: TrainConfig) -> Adam:
         config: the run's settings, which are the groups' defaults.
 
     Raises:
-        ConfigError: if the parameters and Adam's state need more memory than the machine has.
+        ConfigError: if the parameters and Adam's state need more memory than the machine has. Tables in files do not
+            count.
     """
-    require(3.0 * 4 * model.size(), "the model's parameters and Adam's state")
     groups = [_plain(group, config) for group in model.groups()]
+    tables = [parameter for group in model.groups() if group.settings.sparse for parameter in group.parameters]
+    in_files = sum(table.numel() for table in tables) if model.tables.in_files else 0
+    require(3.0 * 4 * (model.size() - in_files), "the model's parameters and Adam's state")
     deferred = {module.table: module.deferred for module in parts(model, DefersGradient) if module.deferred is not None}
     betas = (config.adam_beta1, config.adam_beta2)
     return Adam(groups, deferred, config.learning_rate, betas, config.adam_eps, model.tables)

@@ -11,7 +11,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from nerfloom.base.device import wait_for
+from nerfloom.base.evenly_spaced import evenly_spaced
+from nerfloom.cameras.view import View
+from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_batch
+from nerfloom.gaussian_model import GaussianModel
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.march.occupancy import own_cells
 from nerfloom.model import evaluating
@@ -20,14 +24,15 @@ from nerfloom.renderable import parts
 from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.first_crossing import FirstCrossing
 from nerfloom.samplers.occupancy import OccupancySampler
-from nerfloom.splats.capacity import Capacity
-from nerfloom.splats.resolution import ImageSizes
+from nerfloom.splats.drawing import splat_camera
 
 if TYPE_CHECKING:
     from nerfloom.training.trainer import Trainer
 
 PROBE_RAYS, WARM_UP_RAYS = 1024, 64
 """Numbers of random training rays for measuring the savings, and for the warm-up before."""
+PROBE_VIEWS = 4
+"""Maximum number of training images for counting the Gaussians that they show."""
 MIN_REPORTED = 0.005
 """Minimum skipped fraction to print."""
 MIN_SPEEDUP = 1.1
@@ -58,7 +63,7 @@ def lines(rungs: list[Rung]) -> list[str]:
 
 @torch.no_grad()
 def skip_report(trainer: Trainer) -> list[Rung]:
-    """Measure the work that the model of `trainer` skips, on random training rays; empty if it skips nothing."""
+    """Measure the work that the model of `trainer` skips, on training rays or images; empty if it skips nothing."""
     model, rungs = trainer.model, []
     samplers = parts(model, SkipsCells)
     if samplers and isinstance(model, RayModel):
@@ -68,16 +73,8 @@ def skip_report(trainer: Trainer) -> list[Rung]:
         share = sum(capacity.left_out for capacity in capacities) / rays
         says = f"rays of batches, dropped because the sample buffer was full: {share:.1%}"
         rungs.append(Rung("rays of batches, buffer full", share, None, "no switch", says))
-    splats = getattr(model, "capacity", None)
-    if isinstance(splats, Capacity) and splats.entries:
-        share = splats.left_out / splats.entries
-        says = f"entries of tiles' lists of Gaussians, dropped because the buffer was full: {share:.1%}"
-        rungs.append(Rung("entries of tiles' lists, buffer full", share, None, "no switch", says))
-    if isinstance(sizes := getattr(model, "sizes", None), ImageSizes) and (count := sizes.steps.total()):
-        share = 1 - sum(steps / 4**octaves for octaves, steps in sizes.steps.items()) / count
-        widths = ", ".join(f"{sizes.steps[o] / count:.0%} of steps 1/{1 << o}" for o in sorted(sizes.steps) if o)
-        says = f"pixels of training images: {share:.0%}, since steps use smaller images ({widths})"
-        rungs.append(Rung("pixels of training images", share, None, "--reduced-until 0", says))
+    if isinstance(model, GaussianModel):
+        rungs += _drawing_rungs(trainer.train_set, model)
     updated, there = trainer.optimizer.entries
     if there:
         share = updated / there
@@ -136,6 +133,32 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
             says += f", and the others {1 / (1 - share):.1f} x as often"
         rungs.append(Rung("pixels, which see background alone", share, None, "--silhouette-pixels False", says))
     return rungs
+
+
+def _drawing_rungs(dataset: Dataset, model: GaussianModel[Any]) -> list[Rung]:
+    rungs, total, sizes = [], len(model.columns["means"].values), model.sizes
+    indices = evenly_spaced(len(dataset), PROBE_VIEWS).tolist()
+    if total:
+        share = 1 - sum(_num_listed(model, dataset.view(index)) for index in indices) / (len(indices) * total)
+        says = f"Gaussians that an image does not show: {share:.0%}, in the mean of {len(indices)} training images"
+        rungs.append(Rung("Gaussians, not in an image", share, None, "no switch", says))
+    if needed := model.capacity.entries:
+        share = model.capacity.left_out / needed
+        says = f"entries of tiles' lists of Gaussians, dropped because the buffer was full: {share:.1%}"
+        rungs.append(Rung("entries of tiles' lists, buffer full", share, None, "no switch", says))
+    if count := sizes.steps.total():
+        share = 1 - sum(steps / 4**octaves for octaves, steps in sizes.steps.items()) / count
+        widths = ", ".join(f"{sizes.steps[o] / count:.0%} of steps 1/{1 << o}" for o in sorted(sizes.steps) if o)
+        says = f"pixels of training images: {share:.0%}, since steps use smaller images ({widths})"
+        rungs.append(Rung("pixels of training images", share, None, "--reduced-until 0", says))
+    return rungs
+
+
+def _num_listed(model: GaussianModel[Any], view: View) -> int:
+    """Return the number of Gaussians in the lists of a view's tiles: the others are neither sorted nor blended."""
+    camera = splat_camera(view.camera, model.near, model.look())
+    lists = model.rasteriser.tile(model.rasteriser.project(model.gaussians_in(view), camera), camera)
+    return len(lists.ids[: int(lists.offsets[-1])].unique())
 
 
 def _along_rays(place: str, before: int, after: int, faster: float) -> str:

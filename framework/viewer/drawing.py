@@ -13,7 +13,7 @@ from torch import Tensor
 from nerfloom.base.device import wait_for
 from nerfloom.cameras.ndc import Ndc
 from nerfloom.cameras.view import View
-from nerfloom.evaluation.appearance import appearance_of, shown_appearance
+from nerfloom.evaluation.appearance import shown_appearance
 from nerfloom.evaluation.outputs import (
     ERROR,
     Arrays,
@@ -81,7 +81,7 @@ def _kept(
 
 
 def _appearance(loaded: Loaded, image: int | None) -> AbstractContextManager[None]:
-    appearance = appearance_of(loaded.model)
+    appearance = loaded.model.appearance
     if appearance is None:
         return nullcontext()
     own = appearance.of_images().detach()

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerfloom.evaluation.appearance import appearance_of
 from nerfloom.viewer.crop_panel import CropPanel
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.render_queue import RenderQueue
@@ -59,7 +58,7 @@ class Panel:
         client.camera.on_update(self._moved)
 
     def _add_appearance(self) -> Any:
-        appearance = appearance_of(self._queue.loaded.model)
+        appearance = self._queue.loaded.model.appearance
         count = 0 if appearance is None else len(appearance.of_images())
         if not count:
             return None

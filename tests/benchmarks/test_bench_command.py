@@ -45,7 +45,7 @@ def test_bad_input_is_refused_in_a_line(shared_tiny: Path, tmp_path: Path, refus
         ours.main, "contention", "--data", shared_tiny, "--rows", "loop3", *output, status=2
     )
     in_a_file = ("--output-dir", shared_tiny / "transforms_train.json" / "below")
-    assert "cannot write" in refused(ours.main, "ablation", "--data", shared_tiny, *in_a_file)
+    assert "cannot write" in refused(ours.main, "processes", "--data", shared_tiny, *in_a_file)
     nothing = ("--data", shared_tiny, "--method", " ", "--output-dir", tmp_path)
     assert "--method is empty; give the name of a method" in refused(bench.main, "profile-step", *nothing, status=2)
     asked = ("--method", "instant-ngp", "--output-dir", tmp_path)

@@ -10,11 +10,12 @@ import yaml
 
 from benchmarks.city import City, Constants, Measured, constants, markdown, measured, rows
 from nerfloom.base.errors import FlagError
-from nerfloom.base.json_files import write_json
 from nerfloom.blocks.block import TrainedBlock
 from nerfloom.blocks.files import BlockList, write_blocks
 from nerfloom.blocks.split import grid_blocks
 from nerfloom.blocks.visibility import Visibility
+from nerfloom.cameras.poses import Placement
+from nerfloom.training.block_plan import BlockPlan
 
 ROOT = Path(__file__).parents[2]
 
@@ -45,24 +46,26 @@ def test_images_of_a_block_are_those_of_a_grid() -> None:
 
 
 def test_lists_of_images_take_as_many_bytes_as_the_formulas_say(tmp_path: Path) -> None:
-    """Indices of seven digits: 15 bytes of plan.json, 9 of blocks.yml, and 16 of a command with its pointers."""
+    """Indices of seven digits: 15 bytes of plan.json, 13 of recipe.json, and 9 of blocks.yml."""
     count, few = 20_000, 100
-    sizes: dict[str, list[int]] = {"plan.json": [], "blocks.yml": []}
+    sizes: dict[str, list[int]] = {"plan.json": [], "runs/000/recipe.json": [], "blocks.yml": []}
     for number in (few, count):
         cameras = tuple(range(1_000_000, 1_000_000 + number))
-        write_json(tmp_path / "plan.json", {"method": "nerfacto", "flags": [], "cameras": [list(cameras)]})
         block = TrainedBlock((0.0, 0.0, 0.0), 1.0, cameras, tmp_path)
+        (tmp_path / "plan.json").unlink(missing_ok=True)
+        BlockPlan("nerfacto", (), (block,), (None,), tmp_path, "").claim_folder(Placement.of(None, 1.0))
         write_blocks(tmp_path / "blocks.yml", BlockList(((-1.0,) * 3, (1.0,) * 3), 0.05, 1e3, (block,)))
         for name, found in sizes.items():
             found.append((tmp_path / name).stat().st_size)
     each = {name: (after - before) / (count - few) for name, (before, after) in sizes.items()}
     assert each["plan.json"] == pytest.approx(15, abs=0.01)
+    assert each["runs/000/recipe.json"] == pytest.approx(13, abs=0.01)
     assert each["blocks.yml"] == pytest.approx(9, rel=0.1)
     assert yaml.safe_load((tmp_path / "blocks.yml").read_text())["blocks"][0]["cameras"][-1] == 1_000_000 + count - 1
     city = City(images=2_000_000, blocks=1, overlap=0.0)
     assert value("`plan.json`", city, Measured()) == "30 MB"
     assert value("`blocks.yml`", city, Measured()) == "18 MB"
-    assert value("command of a job", city, Measured()) == "32 MB"
+    assert value("`recipe.json` of a block", city, Measured()) == "26 MB"
 
 
 def test_constants_are_those_of_the_package() -> None:

@@ -1,6 +1,7 @@
 """ns-bench gpu: the parts that can be tested without a GPU."""
 
 import copy
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from nerfloom.benchmarks.gpu import (
     reached,
     timed_steps,
 )
+from nerfloom.benchmarks.kernels import on_any_device
 from nerfloom.cli.bench import main
 from nerfloom.comparison.measures import Row
 from tests.conftest import Refused
@@ -78,10 +80,13 @@ def test_parts_for_which_too_little_time_is_left_are_left_out_and_named(capsys: 
 
 
 def test_kernels_are_not_timed_after_their_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are made even so, for their names. The large ones: test_every_kernel_is_measured_and_right."""
     monkeypatch.setattr("nerfloom.benchmarks.gpu.triton_backend.available", lambda: False)
+    monkeypatch.setattr("nerfloom.benchmarks.gpu.on_any_device", lambda samples: islice(on_any_device(samples), 1))
     monkeypatch.setattr(Ceilings, "measured", lambda *sizes: Ceilings(1.0, 1.0, 1.0))  # some take half a minute
     found = measured_kernels(torch.device("cpu"), 64, 1, -1.0)
     assert found["kernels"] == []
+    assert found["kernels not timed"][0].startswith("hash grid")
     assert "contraction" in found["kernels not timed"]
 
 

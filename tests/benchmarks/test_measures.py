@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from benchmarks import ablation, cache, contention, pose_refinement, poses
+from benchmarks import cache, contention, pose_refinement, poses, processes
 from benchmarks.children import output_of
 from nerfloom.base.errors import ConfigError, DataError, NerfloomError
 from nerfloom.cameras.cameras import Cameras
@@ -21,20 +21,10 @@ from tests.dataparsers.sparse_models import Capture, make_capture, write_colmap
 
 def test_a_curve_meets_the_target_between_its_points() -> None:
     curve = [(0.0, 0.0), (10.0, 20.0), (20.0, 30.0), (30.0, 28.0), (40.0, 34.0)]
-    assert ablation.crossing(curve, 25.0) == pytest.approx(15.0)
-    assert ablation.crossing(curve, 29.0) == pytest.approx(19.0)  # the first time
-    assert ablation.crossing(curve, 34.0) == pytest.approx(40.0)
-    assert ablation.crossing(curve, 34.1) is None
-
-
-def test_means_over_seeds_with_the_spread_of_a_run() -> None:
-    row = ablation.summary([(10.0, 30.0), (20.0, 32.0)])
-    assert row["seconds to the target"] == 15.0
-    assert row["test PSNR, dB"] == 31.0
-    assert row["standard deviation of a run, dB"] == pytest.approx(math.sqrt(2), abs=1e-3)
-    missed = ablation.summary([(10.0, 30.0), (None, 32.0)])
-    assert missed["seconds to the target"] is None  # a mean over runs that met it would flatter the variant
-    assert ablation.summary([(10.0, 30.0)])["standard deviation of a run, dB"] is None
+    assert processes.crossing(curve, 25.0) == pytest.approx(15.0)
+    assert processes.crossing(curve, 29.0) == pytest.approx(19.0)  # the first time
+    assert processes.crossing(curve, 34.0) == pytest.approx(40.0)
+    assert processes.crossing(curve, 34.1) is None
 
 
 def test_the_fair_share_is_that_of_threads_over_cores() -> None:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -105,7 +105,7 @@ def test_every_sampler_comes_near_the_truth(monkeypatch: pytest.MonkeyPatch) -> 
     assert seconds > 0
     truth = scene.truth(rays, WHITE).color
     with torch.no_grad():
-        for name, render in renderers(scene, fitted, partial(filled_grid, scene, 32, 0), 64).items():
+        for name, render in renderers(scene, fitted, cache(partial(filled_grid, scene, 32, 0)), 64).items():
             torch.manual_seed(0)
             error = measured("nested", name, 64, render, rays, truth).mean_error
             print(f"nested, {name}: colour off by {error:.1e}")

@@ -50,7 +50,9 @@ def test_every_training_image_is_in_a_block_and_each_block_has_room_of_its_own(t
         own = read_transforms(block.run / TRANSFORMS)
         assert own.scale > 1.3 * whole.scale
         torch.testing.assert_close(own.transform[:, :3], whole.transform[:, :3])
-        parsed = read_run(block.run).parse("train")
+        run = read_run(block.run)
+        assert run.config.train_image_indices == block.cameras
+        parsed = run.parse("train")
         assert len(parsed.image_paths) == len(block.cameras)
         assert float(parsed.cameras.camera_to_worlds[:, :, 3].abs().max()) == pytest.approx(1, abs=0.1)
 

@@ -1,7 +1,6 @@
 """The commands as a person meets them: help, flags, files, errors in one line."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -201,16 +200,3 @@ def test_a_recipe_with_overrides_and_resuming(shared_tiny: Path, tmp_path: Path)
     assert done.returncode == 0, done.stderr
     assert "at step 5" in done.stderr
     assert (folder / "nerfstudio_models" / "step-000000008.ckpt").is_file()
-
-
-@pytest.mark.medium
-def test_python_3_10_syntax() -> None:
-    """The oldest supported Python must be able to compile every file."""
-    import ast
-
-    root = Path(__file__).parents[2]
-    files = [f for folder in ("framework", "methods", "dataparsers") for f in (root / folder).rglob("*.py")]
-    assert len(files) > 30
-    for file in files:
-        ast.parse(file.read_text(), feature_version=(3, 10))
-    assert sys.version_info >= (3, 10)

@@ -54,7 +54,7 @@ def test_a_runs_folder_stands_for_its_config(trained: Path, tmp_path: Path, refu
         assert done.returncode == 0, done.stderr
         content = json.loads((trained / "eval.json").read_text())
         assert content["results"]["psnr"] > 0
-        assert f"kernels: {content['kernels']}" in called("ns-train", "--resume", trained).stderr
+    assert f"kernels: {content['kernels']}" in called("ns-train", "--resume", trained).stderr
     assert called("ns-export", "cameras", trained, "--output-dir", tmp_path).returncode == 0
     assert read_run(trained).folder == trained
     (trained / "eval.json").unlink()

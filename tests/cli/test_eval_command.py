@@ -22,6 +22,7 @@ from nerfloom.ray_model import RayModel
 from nerfloom.rendering.rendered import Picture
 from tests.cli.helpers import called, train
 from tests.conftest import Refused
+from tests.training.helpers import Malicious
 
 RAYS = ("--rays-per-pixel", 4)
 
@@ -189,14 +190,6 @@ def test_settings_beyond_any_machine_are_refused(
 ) -> None:
     edit_config(finished, **settings)
     assert refused(main, "--load-config", finished / "config.yml", "--device-type", "cpu").startswith(f"error: {said}")
-
-
-class Malicious:
-    def __init__(self, proof: Path) -> None:
-        self.proof = proof
-
-    def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return (Path.touch, (self.proof,))
 
 
 @pytest.mark.parametrize("zipped", [True, False])

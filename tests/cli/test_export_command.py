@@ -153,6 +153,11 @@ def test_what_cannot_be_exported_is_refused(ball: Path, tmp_path: Path, refused:
     assert "no training ray ends in a surface" in refused(main, "pointcloud", *given, *few, "--reach", 1e-6)
 
 
+def test_flags_of_nerfstudio_are_answered(tmp_path: Path, refused: Refused) -> None:
+    said = refused(main, "pointcloud", tmp_path, "--output-dir", tmp_path, "--bounding-box-min=-1", status=2)
+    assert "--bounding-box-min is of nerfstudio's ns-export; here it is --crop-box X,Y,Z,X,Y,Z" in said
+
+
 def test_normals_are_turned_and_not_moved() -> None:
     """A wall x = 2 of the scene; the input is turned by a quarter about z."""
     quarter = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7]]).double()

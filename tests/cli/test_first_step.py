@@ -49,7 +49,7 @@ def test_what_is_imported_before_the_first_step(shared_tiny: Path, tmp_path: Pat
 
     Torch is imported from the start, and its own imports are not slow.
     """
-    words = ["instant-ngp", "--data", shared_tiny, "--output-dir", tmp_path, *TINY_NGP]
+    words = ["instant-ngp", "--data", shared_tiny, "--output-dir", tmp_path, *TINY_NGP, "--machine.num-threads", 1]
     done = forks.run(FIRST_STEP, *words)
     assert done.returncode == 0, done.stderr
     without, with_files = (set(line.split()) for line in done.stdout.splitlines())

@@ -99,7 +99,7 @@ def test_nothing_is_overwritten(tmp_path: Path, refused: Refused) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     assert (tmp_path / "file").read_text() == "mine"
     below = tmp_path / "file" / "deeper"
-    assert "cannot write" in refused(main, "my-method", "--dir", below)
+    assert "; choose another --dir" in refused(main, "my-method", "--dir", below)
     assert "the method's name comes first" in refused(main, "--dir", tmp_path / "new")
 
 

@@ -337,7 +337,7 @@ def test_what_cannot_be_rendered_is_refused_at_once(ball_run: Path, tmp_path: Pa
     path = ("camera-path", ball_run, "--camera-path-filename", nowhere)
     assert said(*path, status=1).endswith("none: No such file or directory")
     assert "the run knows its data format; leave it out" in said("orbit", ball_run, "blender", status=1)
-    assert "nerfstudio's; here it is --fps" in said("interpolate", nowhere, "--frame_rate=24")
+    assert "is of nerfstudio's ns-render; here it is --fps" in said("interpolate", nowhere, "--frame_rate=24")
     assert "the extension of --output-path sets the format" in said("spiral", nowhere, "--output-format", "images")
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,13 @@ def write_images(folder: Path, names: list[str], width: int = WIDTH, height: int
     folder.mkdir(parents=True, exist_ok=True)
     for index, name in enumerate(names):
         iio.imwrite(folder / name, np.full((height, width, 3), 20 * index % 256, dtype=np.uint8))
+
+
+def edit(folder: Path, change: Callable[[dict[str, Any]], Any], file: str = "transforms.json") -> None:
+    """Change a JSON file of a folder in place."""
+    content = json.loads((folder / file).read_text())
+    change(content)
+    (folder / file).write_text(json.dumps(content))
 
 
 def moved(given: np.ndarray, unit: float, shift: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
 """The COLMAP model beside a transforms.json gives its images' points, if the file was made from it."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from nerfloom import ParsedScene
 from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.colmap import Colmap
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
+from tests.dataparsers.captures import edit
 from tests.dataparsers.sparse_models import SIZE, Capture, make_capture, misses, write_colmap, write_images
 
 ALL = Nerfstudio(eval_mode="all")
@@ -44,12 +44,6 @@ def write_transforms(folder: Path, capture: Capture, **more: Any) -> Path:
     content = {"w": SIZE[0], "h": SIZE[1], **INTRINSICS, "applied_transform": APPLIED.tolist(), "applied_scale": SCALE}
     (folder / "transforms.json").write_text(json.dumps(content | {"frames": frames} | more))
     return folder
-
-
-def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    content = json.loads((folder / "transforms.json").read_text())
-    change(content)
-    (folder / "transforms.json").write_text(json.dumps(content))
 
 
 def seen(scene: ParsedScene) -> list[str]:

@@ -1,9 +1,7 @@
 """The nerfstudio format: rays go where the file's cameras look, and nonsense is refused in one line."""
 
 import dataclasses
-import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from tests.dataparsers.captures import (
     HEIGHT,
     POINTS,
     WIDTH,
+    edit,
     miss,
     poses,
     to_scene,
@@ -36,12 +35,6 @@ from tests.exr_files import write_exr
 EXACT = 2e-6
 """Precision of a ray's direction in float32."""
 ALL = Nerfstudio(eval_mode="all")
-
-
-def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    content = json.loads((folder / "transforms.json").read_text())
-    change(content)
-    (folder / "transforms.json").write_text(json.dumps(content))
 
 
 @pytest.fixture
@@ -351,8 +344,12 @@ def test_the_up_direction_that_a_file_states(capture: Path, stated: Any) -> None
     assert expected is not None
     assert asked is not None
     edit(capture, lambda content: content.update(orientation_override=stated))
-    assert torch.equal(Nerfstudio().parse(capture, "train").transform, expected)  # type: ignore[arg-type]
-    assert torch.equal(Nerfstudio(orientation_method="pca").parse(capture, "train").transform, asked)  # type: ignore[arg-type]
+    left_to_the_file = Nerfstudio().parse(capture, "train")
+    of_the_flag = Nerfstudio(orientation_method="pca").parse(capture, "train")
+    assert torch.equal(left_to_the_file.transform, expected)  # type: ignore[arg-type]
+    assert torch.equal(of_the_flag.transform, asked)  # type: ignore[arg-type]
+    assert load_dataset(left_to_the_file, "train").z_is_up
+    assert not of_the_flag.z_is_up
 
 
 def test_the_unit_of_depth_in_exr_is_said(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -407,7 +404,7 @@ def cell(row: int, column: int, value: Any) -> Any:
 
 BAD = {
     "no frames": (put(frames=[]), "lists no frames"),
-    "frames is an object": (put(frames={"a": 1}), "lists no frames"),
+    "frames is an object": (put(frames={"a": 1}), "lists no frames; 'frames' must be a list"),
     "frame is a number": (lambda c: c["frames"].__setitem__(4, 7), "frame 4 is 7; it must be an object"),
     "no file": (lambda c: c["frames"][4].pop("file_path"), "frame 4: 'file_path' is missing"),
     "file name with a zero": (frame(file_path="a\0b"), "frame 4: 'file_path' is not the name of a file"),
@@ -439,7 +436,7 @@ BAD = {
     "endless width": (put(w=1e300), "frame 0: 'w' is 1e.300; it must be from 1"),
     "no pixel wide": (put(w=0.3), "frame 0: 'w' is 0.3; it must be from 1"),
     "focal length beyond float32": (put(fl_x=1e200), "has fx, fy, cx, cy = 1e.200, 52, 21, 14 pixels: out of range"),
-    "focal length that float32 rounds to zero": (put(fl_y=1e-60), "pixels: out of range"),
+    "focal length that float32 rounds to zero": (put(fl_y=1e-60), "pixels: out of range; correct them"),
     "centre beyond float32": (frame(cx=-1e200), r"004\.png: its camera has .* pixels: out of range"),
     "other shape": (put(w=30, h=40), r"000\.png is 40x30 pixels, but its camera is for 30x40"),
     "unknown camera": (put(camera_model="OPENCVV"), "unknown camera_model 'OPENCVV'. Did you mean 'OPENCV'"),
@@ -457,9 +454,12 @@ BAD = {
         "'applied_transform': the pose is not rigid",
     ),
     "applied scale is zero": (put(applied_scale=0), "'applied_scale' is 0; it must be a number above zero"),
-    "applied scale is next to zero": (put(applied_scale=5e-324), "'applied_scale' give a transform out of range"),
+    "applied scale is next to zero": (
+        put(applied_scale=5e-324),
+        "'applied_scale' give a transform out of range; correct",
+    ),
     "cube is nothing": (put(aabb_scale=-1), "'aabb_scale' is -1"),
-    "cube is a point": (put(aabb_scale=1e-300), "give a box that is empty or too large"),
+    "cube is a point": (put(aabb_scale=1e-300), "give a box that is empty or too large; change them"),
     "cube is endless": (put(aabb_scale=1e300), "give a box that is empty or too large"),
     "cube is nowhere": (put(aabb_scale=1, offset=[0, 1e300, 0]), "give a box that is empty or too large"),
     "offset is a number": (put(aabb_scale=1, offset=0.5), "'offset' is 0.5; it must be a list of 3 numbers"),

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,10 @@ import torch
 
 from nerfloom.base.errors import DataError
 from nerfloom.dataparsers.polycam import Polycam
-from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, WIDTH, poses, worst_miss, write_images
+from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, WIDTH, edit, poses, worst_miss, write_images
 
 STAMPS = [str(48_000_000_000 + 33_000_000 * index) for index in range(9)]
+ONE = f"keyframes/cameras/{STAMPS[4]}.json"
 
 
 def write_polycam(folder: Path, kind: str = "") -> Path:
@@ -27,13 +27,6 @@ def write_polycam(folder: Path, kind: str = "") -> Path:
         content.update({f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)})
         (keyframes / f"{kind}cameras" / f"{stamp}.json").write_text(json.dumps(content))
     return folder
-
-
-def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    file = folder / "keyframes" / "cameras" / f"{STAMPS[4]}.json"
-    content = json.loads(file.read_text())
-    change(content)
-    file.write_text(json.dumps(content))
 
 
 @pytest.fixture
@@ -72,7 +65,7 @@ def test_depth_goes_with_its_image(capture: Path) -> None:
 
 
 def test_sizes_that_are_not_stated_are_those_of_the_images(capture: Path) -> None:
-    edit(capture, lambda content: content.pop("width"))
+    edit(capture, lambda content: content.pop("width"), ONE)
     scene = Polycam(eval_interval=0).parse(capture, "train")
     assert worst_miss(scene, poses()) < 2e-6
 
@@ -98,7 +91,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_content_is_refused_by_name(capture: Path, name: str) -> None:
     change, words = BAD[name]
-    edit(capture, change)
+    edit(capture, change, ONE)
     with pytest.raises(DataError, match=words) as error:
         Polycam().parse(capture, "train")
     assert "\n" not in str(error.value)
@@ -114,7 +107,7 @@ def test_bad_folders_and_flags(capture: Path, tmp_path: Path) -> None:
         Polycam(depth_unit_scale_factor=0).parse(capture, "train")
     for file in (capture / "keyframes" / "cameras").iterdir():
         file.unlink()
-    with pytest.raises(DataError, match=r"has no cameras"):
+    with pytest.raises(DataError, match=r"has no cameras .*; export Polycam's raw data again"):
         Polycam().parse(capture, "train")
 
 

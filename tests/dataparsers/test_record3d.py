@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.record3d import Record3D
 from nerfloom.dataparsers.rotations import rotations
-from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, WIDTH, poses, worst_miss, write_images
+from tests.dataparsers.captures import CX, CY, FX, FY, HEIGHT, WIDTH, edit, poses, worst_miss, write_images
 
 COUNT = 12
 
@@ -39,13 +38,6 @@ def write_record3d(folder: Path) -> Path:
     }
     (export / "metadata.json").write_text(json.dumps(content))
     return folder
-
-
-def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    file = folder / "EXR_RGBD" / "metadata.json"
-    content = json.loads(file.read_text())
-    change(content)
-    file.write_text(json.dumps(content))
 
 
 @pytest.fixture
@@ -109,7 +101,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_content_is_refused_by_name(capture: Path, name: str) -> None:
     change, words = BAD[name]
-    edit(capture, change)
+    edit(capture, change, "EXR_RGBD/metadata.json")
     with pytest.raises(DataError, match=words) as error:
         Record3D().parse(capture, "train")
     assert "\n" not in str(error.value)

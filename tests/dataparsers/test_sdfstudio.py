@@ -24,6 +24,7 @@ from tests.dataparsers.captures import (
     HEIGHT,
     POINTS,
     WIDTH,
+    edit,
     miss,
     poses,
     seen_at,
@@ -77,12 +78,6 @@ def folder(tmp_path: Path) -> Path:
     return write_sdfstudio(tmp_path / "scan")
 
 
-def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    content = json.loads((folder / "meta_data.json").read_text())
-    change(content)
-    (folder / "meta_data.json").write_text(json.dumps(content))
-
-
 @pytest.mark.parametrize("orientation", ["none", "up"])
 def test_rays_meet_the_points_in_the_original_frame(folder: Path, orientation: Any) -> None:
     assert find_data(folder) == find_data(folder / "meta_data.json") == (folder, "sdfstudio")
@@ -124,16 +119,17 @@ def test_masks_and_depths_go_with_their_images(folder: Path) -> None:
 
 def test_what_may_be_missing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An image without mask is left out; so is all of the rest that a folder need not have."""
-    edit(folder, lambda c: c["frames"][3].pop("foreground_mask"))
+    edit(folder, lambda c: c["frames"][3].pop("foreground_mask"), "meta_data.json")
     assert len(SdfStudio(eval_interval=0).parse(folder, "train").image_paths) == 8
     assert "1 of 9 images have no mask and are skipped, the first 000003_rgb.png" in capsys.readouterr().err
     for frame_key in ("foreground_mask", "sensor_depth_path"):
-        edit(folder, lambda c, key=frame_key: [frame.pop(key, None) for frame in c["frames"]])
-    edit(folder, lambda c: [c.pop(key) for key in ("worldtogt", "scene_box", "width", "height")])
+        edit(folder, lambda c, key=frame_key: [frame.pop(key, None) for frame in c["frames"]], "meta_data.json")
+    edit(folder, lambda c: [c.pop(key) for key in ("worldtogt", "scene_box", "width", "height")], "meta_data.json")
     scene = SdfStudio(eval_interval=0).parse(folder, "train")
     assert worst_miss(scene, poses(COUNT)) < 2e-6
     assert (scene.mask_paths, scene.depth_paths, scene.object_distances) == (None, None, None)
-    edit(folder, lambda c: [frame.update(mask_path="000000_foreground_mask.png") for frame in c["frames"]])
+    named = "000000_foreground_mask.png"
+    edit(folder, lambda c: [frame.update(mask_path=named) for frame in c["frames"]], "meta_data.json")
     assert SdfStudio(eval_interval=0).parse(folder, "train").mask_paths is not None
 
 
@@ -161,7 +157,7 @@ BAD: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 @pytest.mark.parametrize("name", BAD)
 def test_bad_content_is_refused_by_name(folder: Path, name: str) -> None:
     change, words = BAD[name]
-    edit(folder, change)
+    edit(folder, change, "meta_data.json")
     with pytest.raises(DataError, match=words) as error:
         SdfStudio().parse(folder, "train")
     assert "\n" not in str(error.value)

@@ -14,11 +14,11 @@ from nerfloom.evaluation.appearance import fit_appearance, held_out_appearance, 
 from nerfloom.fields.appearance import Appearance
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.color import to_linear, to_srgb
-from nerfloom.renderable import RendersRays
-from nerfloom.rendering.light import make_light
-from nerfloom.rendering.rendered import Picture, Rendered
-from nerfloom.testing.ball import cameras_at, trace
+from nerfloom.rendering.light import Light, make_light
+from nerfloom.rendering.rendered import Rendered
+from nerfloom.testing.ball import cameras_at
 from nerfloom.testing.scenes import ball_in_a_box
+from tests.exact_ball import ExactBall
 
 POSITIONS = torch.tensor([[4.0, 0, 1], [0.0, 4, 1], [-4.0, 0, 1], [0.0, -4, 1]])
 
@@ -75,30 +75,22 @@ def test_a_view_has_the_light_of_the_nearest_image() -> None:
     torch.testing.assert_close(lit.appearance(None, 1)[0], torch.tensor([3.0, 4.0]))
 
 
-class LitBall(RendersRays):
-    """The ball of `ball_in_a_box`, in closed form and in a light."""
+class LitBall(ExactBall):
+    """A ball in a light."""
 
     def __init__(self, kind: str, scene: Scene) -> None:
+        super().__init__(scene)
         light = make_light(AppearanceConfig(appearance=kind), scene)  # type: ignore[arg-type]
         assert light is not None
-        self.scene, self.appearance = scene, light
+        self.light = light
 
     @property
-    def device(self) -> torch.device:
-        return torch.device("cpu")
-
-    @property
-    def rays_at_once(self) -> int:
-        return 5000
+    def appearance(self) -> Light:
+        return self.light
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
-        normals, hits = trace(rays.origins, rays.directions)
-        rgb = torch.where(hits[:, None], 0.5 + 0.4 * normals.clamp(-1, 1), background)
-        lit = self.appearance.lit(rgb, hits.float(), background)
-        return Rendered(lit, rays.fars, rays.fars, hits.float(), 0)
-
-    def render_view(self, view: View, background: Tensor) -> Picture:
-        raise AssertionError
+        shown = super().render(rays, background)
+        return replace(shown, rgb=self.light.lit(shown.rgb, shown.accumulation, background))
 
 
 @pytest.mark.parametrize("kind", ["affine", "tone", "grid"])

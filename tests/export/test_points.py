@@ -7,15 +7,21 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
+from nerfloom import Scene
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
 from nerfloom.data.ply import read_points
 from nerfloom.export.mesh import closedness
 from nerfloom.export.neighbors import inliers, mean_distances, plane_normals
 from nerfloom.export.occupancy import boxes_mesh, cell_centers, write_cells, write_grid
-from nerfloom.export.points import joined, picture_points
+from nerfloom.export.points import joined, picture_points, surface_points
+from nerfloom.geometry.rays import Rays
+from nerfloom.renderable import RendersRays
+from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.samplers.occupancy import OccupancySampler
+from nerfloom.testing.scenes import ball_in_a_box
 from tests.export.test_tsdf import RADIUS, Ball, around
 
 pytest.importorskip("scipy")
@@ -83,6 +89,36 @@ def test_points_of_pictures_lie_on_the_surface() -> None:
     assert float(near.abs().max()) <= 0.5
     masked: Any = Data(cameras=data.cameras, kept=torch.zeros(60, 60, dtype=torch.bool))
     assert not len(joined(picture_points(model, masked, 2000, 2.0)).positions)
+
+
+class InItsLight(RendersRays):
+    """Black in the mean light, and lighter in that of an image."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
+    @property
+    def device(self) -> torch.device:
+        return torch.device("cpu")
+
+    @property
+    def rays_at_once(self) -> int:
+        return 300
+
+    def render(self, rays: Rays, background: Tensor) -> Rendered:
+        shade = torch.zeros(len(rays)) if rays.camera_indices is None else torch.full((len(rays),), 0.5)
+        ones = torch.ones(len(rays))
+        return Rendered(shade[:, None].expand(-1, 3), ones, ones, ones, 0)
+
+    def render_view(self, view: View, background: Tensor) -> Picture:
+        raise AssertionError
+
+
+def test_points_have_the_light_of_no_image() -> None:
+    dataset = ball_in_a_box(16)
+    found = joined(surface_points(InItsLight(dataset.scene), dataset, 1000, None))
+    assert len(found.colors) == 1000
+    assert not found.colors.any()
 
 
 def grid_of(box: list[list[float]]) -> OccupancySampler:

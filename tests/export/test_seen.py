@@ -1,6 +1,8 @@
 """The part of a mesh that cameras see."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from nerfloom.export import seen
 from nerfloom.export.mesh import Mesh, closedness
 from nerfloom.export.meshing import Cleaning
 from nerfloom.export.seen import default_min_views, seen_faces, seen_part
+from nerfloom.export.surface import surface_mesh
 from nerfloom.testing.ball import cameras_at
 from tests.export.test_mesh import sphere, together
 from tests.test_surfaces import trainer_of
@@ -82,6 +85,21 @@ def test_a_surface_that_no_camera_sees_is_an_error() -> None:
         seen_part(plate(0.0), above(2), 3)
     with pytest.raises(ConfigError, match="--min-views is -1"):
         Cleaning(min_views=-1).check()
+
+
+@pytest.mark.medium
+def test_a_surface_is_judged_as_a_whole_if_every_point_counts(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a capture that shows half of the first ball, as by `ns-eval --min-views 0`."""
+    captured = said_otherwise("neus", shared_tiny, tmp_path, {"unbounded": True, "has_alpha": False})
+    monkeypatch.setattr(seen, "seen_faces", lambda mesh, *_: torch.arange(len(mesh.faces)) < len(mesh.faces) // 2)
+    parsed = SimpleNamespace(cameras=captured.train_set.cameras)
+    loaded: Any = SimpleNamespace(
+        model=captured.model.eval(), placement=captured.train_set.placement, parsed=lambda split: parsed
+    )
+    part, whole = (len(surface_mesh(loaded, "marching-cubes", 24, whole=each).faces) for each in (False, True))
+    assert 0 < part < 0.6 * whole
 
 
 def test_captures_of_a_distance_lose_what_nobody_sees(shared_tiny: Path, tmp_path: Path) -> None:

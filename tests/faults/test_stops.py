@@ -93,7 +93,8 @@ main()
 def test_a_stopped_command_exits_as_shells_expect(shared_tiny: Path, tmp_path: Path, forks: Forks) -> None:
     """The command runs in a process of its own, and saves all the time."""
     flags, folder = runs.new_run(shared_tiny, tmp_path, 100_000)
-    done = forks.run(STOPPED, folder / FOLDER, int(signal.SIGTERM), *flags)
+    alone = ("--machine.num-threads", 1)  # the cores are shared with other tests
+    done = forks.run(STOPPED, folder / FOLDER, int(signal.SIGTERM), *flags, *alone)
     assert done.returncode == 143, done.stderr
     assert done.stderr.splitlines()[-1] == f"continue with: ns-train --resume {folder}"
 

@@ -16,7 +16,7 @@ pytest.importorskip("resource")
 pytest.importorskip("pycolmap")
 pytest.importorskip("trimesh")
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory are those of Linux")
-FEW, MANY = 6, 200
+FEW, MANY = 3, 200
 """Inputs for each reader, in the fast set and in the slow one."""
 READERS = (
     "blender", "dnerf", "nerfstudio", "colmap-binary", "colmap-text", "llff", "llff-ndc", "record3d", "polycam",

@@ -123,8 +123,10 @@ def work(task: Task, report: TextIO) -> None:
     readers: dict[str, Reader] = importlib.import_module(task.module).READERS
     base, place = Path(task.base), Place(Path(task.base))
     watch = Watch([place.scratch, place.temporary])
-    pristine = {name: built(readers[name], base / "pristine" / name) for name in task.readers}
-    for name in task.readers:  # undamaged input is taken; and late imports happen now
+    first = {readers[name].build: name for name in reversed(task.readers)}  # some read what others do
+    made = {name: built(readers[name], base / "pristine" / name) for name in first.values()}
+    pristine = {name: made[first[readers[name].build]] for name in task.readers}
+    for name in task.readers:  # what is not damaged is taken; and what is loaded late is loaded now
         place.fill(pristine[name])
         readers[name].read(place.data, place.scratch)
     limit_memory(task.memory)

@@ -10,7 +10,7 @@ from nerfloom.kernels.adam.adam import sparse_adam
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.hash_grid_tangent import LOOK_UP, hash_grid_tangent, hash_grid_tangent_reference
-from nerfloom.kernels.surfaces.distance import distance_network, distance_network_reference
+from nerfloom.kernels.surfaces.distance import distance_network, distance_network_reference, following_positions
 from tests.kernels.compiled import needs_kernels, relative_error
 
 LAYOUT = HashGridLayout.build(4, 4, 40, 9)
@@ -115,6 +115,25 @@ def test_the_reference_has_the_gradient_of_its_output() -> None:
     assert torch.autograd.gradcheck(
         lambda *given: loss_of(distance_network_reference(*given, LAYOUT)), (few, *leaves), fast_mode=True
     )
+
+
+def test_autocast_leaves_distances_their_digits() -> None:
+    """Values and gradients of the form in PyTorch, and the gradient by positions; bfloat16 has three digits."""
+    positions, *network = arguments(300)
+    inside = positions[(positions > 0.01).all(-1) & (positions < 0.99).all(-1)]
+
+    def found(kind: torch.dtype) -> tuple[Tensor, ...]:
+        where = inside.to(kind, copy=True).requires_grad_()
+        table, first, second = (each.to(kind, copy=True).requires_grad_() for each in network)
+        with torch.autocast("cpu", torch.bfloat16, enabled=kind == torch.float32):
+            values = distance_network_reference(where.detach(), table, first, second, LAYOUT)
+            followed = values.detach() + following_positions(where, table, first, second, LAYOUT)
+        slopes = torch.autograd.grad(loss_of(values), (table, first, second))
+        return values.detach(), *slopes, *torch.autograd.grad(loss_of(followed), where)
+
+    for value, truth in zip(found(torch.float32), found(torch.float64), strict=True):
+        assert value.dtype == torch.float32
+        assert relative_error(value, truth) < 1e-4
 
 
 @pytest.mark.parametrize("wrong", [(2, (24, 7)), (3, (5, 23))])

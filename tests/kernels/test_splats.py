@@ -1,7 +1,7 @@
 """Gaussian splatting, from parameters to images and back, against a float64 truth that looks at each pixel."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -29,13 +29,6 @@ from tests.kernels.test_encodings_against_scipy import real_harmonic, unit_vecto
 BOUND = 1e-5
 """Largest error over the largest value, of images and gradients."""
 SIZES = [(1, 1), (1, 40), (33, 1), (16, 16), (17, 15), (32, 48), (5, 100), (47, 31)]
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
 
 
 def test_cpp_has_the_same_columns_of_a_record() -> None:

@@ -1,6 +1,6 @@
 """Structural similarity: the compiled sweep against its reference in float64, and against other implementations."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -54,13 +54,6 @@ def compared(image: Tensor, target: Tensor) -> tuple[float, float]:
     assert value.dtype == gradient.dtype == torch.float32
     assert value.shape == ()
     return abs(value.item() - truth.item()), relative_error(gradient, true_gradient)
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
 
 
 @needs_kernels

@@ -109,6 +109,29 @@ def test_a_forked_process_has_threads_of_its_own(forks: Forks) -> None:
     assert done.stdout.split() == ["0", "True"], done.stderr
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="sets the default size of stacks as Linux allows it")
+def test_threads_have_a_stack_for_a_chunk_where_the_system_gives_less(forks: Forks) -> None:
+    """As on macOS, where a thread has less than the backward pass of a network takes."""
+    code = (
+        "import ctypes, torch\n"
+        "from nerfloom.kernels.networks.mlp import mlp\n"
+        "libc, usual = ctypes.CDLL(None), ctypes.create_string_buffer(256)\n"
+        "assert libc.pthread_attr_init(usual) == 0\n"
+        "assert libc.pthread_attr_setstacksize(usual, ctypes.c_size_t(2**18)) == 0\n"
+        "assert libc.pthread_setattr_default_np(usual) == 0\n"
+        "torch.manual_seed(0)\n"
+        "x, w = [torch.randn(20_000, 32)], [torch.randn(64, 32), torch.randn(16, 64)]\n"
+        "def gradients(threads):\n"
+        "    torch.set_num_threads(threads)\n"
+        "    leaves = [weight.clone().requires_grad_() for weight in w]\n"
+        "    return torch.autograd.grad(mlp(x, leaves).square().sum(), leaves)\n"
+        "alone = gradients(1)\n"
+        "print(all(torch.equal(a, b) for _ in range(20) for a, b in zip(alone, gradients(4))))"
+    )
+    done = forks.run(code)
+    assert (done.returncode, done.stdout.split()) == (0, ["True"]), done.stderr
+
+
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_an_error_in_one_chunk_is_raised_and_the_next_call_works(threads: int) -> None:
     from nerfloom.data.pixels.batch import gather_colors

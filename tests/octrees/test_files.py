@@ -84,7 +84,9 @@ def test_damaged_and_hostile_files(tmp_path: Path) -> None:
 
     count = good["codes"].shape[0]
     refused("no array 'masks'", masks=None)
-    refused("version 2", version=2)
+    refused("no array 'version'", version=None)
+    refused("x.octree has version 1 of the format, and 2 is known; bake it again", version=1, bricks=None)
+    refused("has version 3", version=3, more=np.zeros(2))
     refused("masks", masks=good["masks"].astype(np.float64))
     refused("codes", codes=good["codes"][:-1])
     refused("colors", colors=good["colors"][:, :-1])

@@ -103,11 +103,18 @@ def test_reduced_images_of_record3d(tmp_path: Path) -> None:
     assert worst < 2e-6
 
 
-def test_points_of_record3d_move_with_the_poses(tmp_path: Path) -> None:
-    """Points of all files of a folder: a point that a camera sees is on its ray."""
-    folder = write_record3d(tmp_path / "recording")
+@pytest.mark.parametrize("away", [0.0, 5000.0])
+def test_points_of_record3d_move_with_the_poses(away: float, tmp_path: Path) -> None:
+    """Those of all files of a folder, also far from the origin; a point that a camera sees is where its ray leads."""
+    folder, expected = write_record3d(tmp_path / "recording"), POINTS + np.array([0.0, away, 0.0])
+
+    def move(content: Content) -> None:
+        for pose in content["poses"]:
+            pose[5] += away
+
+    spoil(folder / "EXR_RGBD" / "metadata.json", move)
     (tmp_path / "points").mkdir()
-    for number, point in enumerate(POINTS):
+    for number, point in enumerate(expected):
         write_points(
             tmp_path / "points" / f"{number}.ply", torch.from_numpy(point[None]), torch.full((1, 3), 0.25 * number)
         )
@@ -116,7 +123,7 @@ def test_points_of_record3d_move_with_the_poses(tmp_path: Path) -> None:
     scene = Nerfstudio(eval_interval=0).parse(tmp_path / "out", "train")
     assert scene.points is not None
     found = scene.placement.original_points(scene.points)
-    np.testing.assert_allclose(found, POINTS, atol=1e-5)
+    np.testing.assert_allclose(found, expected, atol=1e-5 + 1e-6 * away)
     with pytest.raises(DataError, match="has no PLY file"):
         record3d.convert(folder, tmp_path / "other", 0, 100, folder)
 

@@ -14,7 +14,6 @@ from nerfloom import Scene
 from nerfloom.base.config import AppearanceConfig, VectorConfig
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.sources import Request
-from nerfloom.evaluation.appearance import appearance_of
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.fields.appearance import make_vectors
 from nerfloom.kernels.color import to_linear, to_srgb
@@ -397,7 +396,7 @@ def dimmed(method: str, kind: str, folder: Path, out: Path, factors: Tensor, **s
 def test_every_method_has_every_kind(method: str, kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     trainer = dimmed(method, kind, shared_tiny, tmp_path, torch.linspace(0.4, 1.0, 10), max_num_iterations=4)
     trainer.train()
-    light = appearance_of(trainer.model)
+    light = trainer.model.appearance
     assert isinstance(light, (AffineLight, ToneLight, GridLight))
     assert "appearance" in trainer.train_step().losses
     assert all(bool(parameter.any()) for parameter in light.parameters())
@@ -450,7 +449,7 @@ def test_half_of_a_dark_photograph_tells_its_light(kind: str, shared_tiny: Path,
     settings = {"max_num_iterations": 200, "appearance_rate": 1e-2, "background": "black", "view_dependence": False}
     trainer = dimmed("instant-ngp", kind, shared_tiny, tmp_path, factors, **settings)
     trainer.train()
-    light, found = appearance_of(trainer.model), {}
+    light, found = trainer.model.appearance, {}
     assert light is not None
     for choice in ("mean", "half", "nearest"):
         light.held_out = choice  # type: ignore[assignment]

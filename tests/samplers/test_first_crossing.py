@@ -200,6 +200,14 @@ def test_what_an_edge_leaves_free_meets_the_surface_behind() -> None:
             assert met.t[-1].item() == pytest.approx(5.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("distance", [3.0, 30.0])
+def test_edges_of_parallel_rays_cover_as_much_far_as_near(distance: float) -> None:
+    ahead, radius = torch.tensor([[0.0, 0, 1]]).double(), torch.tensor([0.01]).double()
+    rays = Rays(torch.tensor([[1.005, 0.0, -distance]]).double(), ahead, pixel_radii=radius, parallel=True)
+    met = crossings(ball, rays, whole(rays, end=2 * distance), SHORTEST)
+    assert met.coverage.tolist() == pytest.approx([0.25], abs=0.05)
+
+
 @pytest.mark.medium
 @pytest.mark.parametrize("name", METHODS)
 def test_a_learnt_ball_is_drawn_as_its_volume(name: str) -> None:

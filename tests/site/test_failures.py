@@ -1,5 +1,6 @@
 """The captures that go wrong have the fault that their pictures are said to show, and nothing else."""
 
+from collections.abc import Iterator
 from types import ModuleType
 
 import numpy as np
@@ -13,15 +14,17 @@ from tests.site.pages import ROOT
 pytestmark = pytest.mark.medium
 
 
-@pytest.fixture
-def failures(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "docs" / "building"))
-    import failures as module
+@pytest.fixture(scope="module")
+def failures() -> Iterator[ModuleType]:
+    """Views of the scene are taken once for all tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "docs" / "building"))
+        import failures as module
 
-    monkeypatch.setattr(module, "SIZE", 32)
-    monkeypatch.setattr(module, "NUM_TRAIN", 6)
-    module.taken.cache_clear()
-    return module
+        patch.setattr(module, "SIZE", 32)
+        patch.setattr(module, "NUM_TRAIN", 6)
+        yield module
+        module.taken.cache_clear()
 
 
 def test_masks_hide_exactly_what_moved(failures: ModuleType) -> None:

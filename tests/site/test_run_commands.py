@@ -57,8 +57,6 @@ MEASURED = {
     "kernels": "--samples 512 --repeats 1",
     "methods": "--data path/to/lego --max-seconds 1",
     "curves": "--data path/to/lego --methods instant-ngp kplanes --budgets 1 2 --seeds 1 --views 1 --plot-dir plots",
-    "ablation": "--data path/to/lego --seconds 1 --seeds 1",
-    "starts": "--data path/to/lego --seconds 1",
     "profile-step": "--data path/to/lego --steps 3 --max-seconds 2",
     "operations": "--methods instant-ngp --before 2 --steps 2 --output results/operations.json",
     "pose-refinement": "--seconds 1",

@@ -95,7 +95,7 @@ def test_pictures_are_those_of_all_gaussians(tmp_path: Path) -> None:
 
 @needs_kernels
 @pytest.mark.medium
-@pytest.mark.parametrize("strategy", ["adc", "mcmc", "relocation"])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", pytest.param("relocation", marks=pytest.mark.slow)])
 def test_a_run_grows_and_goes_on_with_the_same_bits(
     strategy: str, shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,6 +141,16 @@ def test_a_run_with_a_limit_is_one_without(shared_tiny: Path, tmp_path: Path) ->
         assert torch.equal(one, other)
     second.train_step()
     assert second.state.step == 4
+
+
+@needs_kernels
+def test_tables_in_files_may_be_larger_than_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limited, free = built(tmp_path, memory_limit=50.0), built(tmp_path)
+    size = 12.0 * sum(column.numel() for column in free.parameters())
+    monkeypatch.setattr("nerfloom.kernels.table_memory.machine_memory", lambda: 0.5 * size)
+    make_optimizer(limited, limited.config)
+    with pytest.raises(ConfigError, match="for the model's parameters and Adam's state"):
+        make_optimizer(free, free.config)
 
 
 @needs_kernels

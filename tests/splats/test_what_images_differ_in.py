@@ -11,7 +11,7 @@ from nerfloom import View
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.refinement import Group, PoseRefinement
 from nerfloom.data.pixels.batch import ViewBatch
-from nerfloom.evaluation.appearance import appearance_of, fit_appearance
+from nerfloom.evaluation.appearance import fit_appearance
 from nerfloom.kernels.math import cross_matrix
 from nerfloom.kernels.splats.project import Record, project_reference
 from nerfloom.methods.gaussian_splatting import METHOD, GaussianSplatting, GaussianSplattingConfig
@@ -52,7 +52,7 @@ def test_colours_are_transformed_where_light_differs(given: str, varies: bool, e
     scene = dataclasses.replace(SCENE, appearance_varies=varies)
     config, _ = METHOD.decided(GaussianSplattingConfig(appearance=given), scene)  # type: ignore[arg-type]
     assert config.appearance == expected
-    assert (appearance_of(GaussianSplatting(config, scene)) is None) is (expected == "none")
+    assert (GaussianSplatting(config, scene).appearance is None) is (expected == "none")
 
 
 def test_a_transform_is_learnt_by_the_image_it_is_of() -> None:
@@ -100,7 +100,7 @@ def test_the_appearance_of_a_held_out_image_is_found_by_its_half(shared_tiny: Pa
     pixels = dataset.cameras.image_pixels(1)
     background = torch.zeros(3)
     found = fit_appearance(trainer.model, darker, pixels, background)
-    appearance = appearance_of(trainer.model)
+    appearance = trainer.model.appearance
     assert found is not None
     assert appearance is not None
     view, true = darker.view(1), darker.image(1).float() / 255

@@ -11,6 +11,7 @@ import torch
 from nerfloom.base.errors import CheckpointError
 from nerfloom.training import checkpoint
 from nerfloom.training.checkpoint import list_checkpoints, load_checkpoint, load_newest, save_checkpoint
+from tests.training.helpers import Malicious
 
 
 def save(folder: Path, step: int, keep_all: bool = False, before: int | None = None) -> Path:
@@ -114,14 +115,6 @@ def test_missing_and_foreign_files(tmp_path: Path) -> None:
     torch.save({"format": 99, "model": {}}, tmp_path / "a.ckpt")
     with pytest.raises(CheckpointError, match="not a checkpoint of this version"):
         load_checkpoint(tmp_path / "a.ckpt")
-
-
-class Malicious:
-    def __init__(self, proof: Path) -> None:
-        self.proof = proof
-
-    def __reduce__(self) -> tuple:
-        return (Path.touch, (self.proof,))
 
 
 def test_a_checkpoint_cannot_run_code(tmp_path: Path) -> None:

@@ -77,15 +77,6 @@ def started(*words: object) -> list[subprocess.Popen[str]]:
     ]
 
 
-def ended(process: subprocess.Popen[str]) -> str:
-    try:
-        return process.communicate(timeout=PATIENCE)[1]
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
-        raise
-
-
 @dataclasses.dataclass
 class Two:
     """The files of two processes."""
@@ -224,7 +215,7 @@ def test_if_one_process_is_killed_the_other_ends_and_says_how_to_continue(
     both = started("nerfloom.cli.train", *flags)
     runs.wait_for_checkpoint(both[0], folder)
     both[killed].kill()
-    said = [ended(process) for process in both]
+    said = [runs.ended(process) for process in both]
     assert both[1 - killed].returncode == 1
     errors = [line for line in said[1 - killed].splitlines() if "error" in line]
     assert len(errors) == 1

@@ -86,7 +86,7 @@ def test_poses_that_seem_to_be_folded_are_warned_of(shared_tiny: Path, tmp_path:
             data,
             pixels=pixels,
             cameras=cameras,
-            names=tuple(f"{index}.jpg" for index in range(count)),
+            paths=tuple(Path(f"{index}.jpg") for index in range(count)),
             scene=replace(data.scene, **photographs),  # type: ignore[arg-type]
         )
         return decisions(Trainer(trainer.method, trainer.config, walk)).get("warning, poses")

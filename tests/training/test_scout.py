@@ -15,12 +15,8 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.left_out import LeftOutTiles
 from nerfloom.data.pixels.tiles import Tiles
 from nerfloom.data.sources import SCOUTED_ALONG, Request
-from nerfloom.geometry.rays import Rays
 from nerfloom.registry import load_method
-from nerfloom.renderable import RendersRays
-from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.stress.variants import chosen, with_distractors
-from nerfloom.testing.ball import trace
 from nerfloom.testing.scenes import ball_in_a_box, moving_ball
 from nerfloom.training import trainer as trainer_module
 from nerfloom.training.scout import (
@@ -36,6 +32,7 @@ from nerfloom.training.scout import (
     scout,
 )
 from nerfloom.training.trainer import Trainer
+from tests.exact_ball import ExactBall
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
 
 IMAGES, ALONG, PROBES = 24, 24, 16
@@ -154,30 +151,6 @@ def test_quantiles_of_groups_against_numpy() -> None:
 # -- a field that is exact --------------------------------------------------------------------------------------------
 
 
-class Exact(RendersRays):
-    """The ball of `ball_in_a_box`, in closed form."""
-
-    def __init__(self, dataset: Dataset) -> None:
-        self.scene = dataset.scene
-
-    @property
-    def device(self) -> torch.device:
-        return torch.device("cpu")
-
-    @property
-    def rays_at_once(self) -> int:
-        return 5000
-
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        normals, hits = trace(rays.origins, rays.directions)
-        rgb = torch.where(hits[:, None], 0.5 + 0.4 * normals.clamp(-1, 1), background)
-        depth = torch.where(hits, (0.7 * normals - rays.origins).norm(dim=-1), rays.fars)
-        return Rendered(rgb, depth, depth, hits.float(), 0)
-
-    def render_view(self, view: Any, background: Tensor) -> Picture:
-        raise AssertionError
-
-
 def over_white(dataset: Dataset) -> Tensor:
     """The colours (P, 3) of all pixels over white."""
     rgba = dataset.pixels.float() / 255
@@ -194,7 +167,7 @@ def test_discs_are_found_by_a_field_that_shows_what_is_behind_them() -> None:
     for name, images in (("clean", clean), ("discs", dataset)):
         tiles = LeftOutTiles(images, SCOUTED_ALONG)
         assert tiles.tiles.side == 4
-        out = contradicted(compare(Exact(images), images, tiles.tiles), tiles.tiles.neighbours())
+        out = contradicted(compare(ExactBall(images.scene), images, tiles.tiles), tiles.tiles.neighbours())
         tiles.state.copy_(out)
         found[name] = tiles.counting(torch.arange(len(images.pixels))) == 0
         kept = torch.zeros(len(images.pixels), dtype=torch.bool)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from nerfloom.splats.start import from_points
 from nerfloom.training.skipping import Rung, lines, skip_report
 from tests.conftest import write_tiny
 from tests.training.helpers import assert_same_bits, tensors, tiny_trainer
@@ -38,6 +39,29 @@ def test_rays_without_room_are_told(shared_tiny: Path, tmp_path: Path) -> None:
     (rung,) = (rung for rung in skip_report(trainer) if "buffer full" in rung.name)
     assert rung.skipped == 0.025
     assert "the sample buffer was full: 2.5%" in "\n".join(lines([rung]))
+
+
+def test_gaussians_that_images_do_not_show_are_told(tmp_path: Path) -> None:
+    """Small ones all around the cameras: those with a centre in an image are shown, and others hardly beyond it."""
+    trainer = tiny_trainer("gaussian-splatting", write_tiny(tmp_path / "ball", 64), tmp_path / "run")
+    torch.manual_seed(0)
+    points = 10 * torch.rand(2000, 3) - 5
+    small = from_points(points, torch.full_like(points, 0.5), trainer.model.config.degree, opacity=0.9, size=0.01)
+    trainer.model.set_gaussians(small)
+    (rung,) = (rung for rung in skip_report(trainer) if rung.name == "Gaussians, not in an image")
+
+    def share_within(margin: float) -> float:
+        shares = []
+        for index in (0, 3, 6, 9):
+            columns, rows, ahead = trainer.train_set.cameras.project(points, index)
+            across, down = (at.clamp(-0.5 - margin, 63.5 + margin) == at for at in (columns, rows))
+            shares.append((across & down & ahead).float().mean().item())
+        return sum(shares) / 4
+
+    print(rung.skipped, 1 - share_within(4), 1 - share_within(0))
+    assert 1 - share_within(4) <= rung.skipped <= 1 - share_within(0)
+    assert 0.5 < rung.skipped < 0.99
+    assert f"Gaussians that an image does not show: {rung.skipped:.0%}, " in "\n".join(lines([rung]))
 
 
 def test_what_saved_nothing_is_not_told() -> None:

@@ -63,8 +63,13 @@ FEW_RAYS = {"num_rays_per_batch": 48, "samples_per_batch": 1024}
 """Smaller batches than in tiny runs: a comparison of bits needs little training."""
 
 
+def once_a_method(kinds: list[str]) -> list[Any]:
+    """All kinds. Those of a method whose first kind is asked already are slow: their parts are others' too."""
+    return [pytest.param(kind, marks=pytest.mark.slow if "+" in kind else ()) for kind in kinds]
+
+
 @pytest.mark.medium
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", once_a_method(KINDS))
 def test_resuming_continues_with_the_same_bits(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     """Interrupted after 13 steps, evaluated in between, resumed in a new trainer: as if nothing had happened."""
     settings: dict[str, Any] = {name: value for name, value in FEW_RAYS.items() if name in TINY[kind]}

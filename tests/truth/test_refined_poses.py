@@ -14,7 +14,6 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cameras.rigid_motion import rigid_motions
-from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.batch import draw_batch
@@ -26,12 +25,11 @@ from nerfloom.export.lattice import lattice_of
 from nerfloom.export.meshing import Cleaning, density_mesh, fused_mesh
 from nerfloom.export.points import joined, picture_points, surface_points
 from nerfloom.geometry.points import Points
-from nerfloom.geometry.rays import Rays
-from nerfloom.renderable import RendersRays, training_poses
-from nerfloom.rendering.rendered import Picture, Rendered
-from nerfloom.testing.ball import RADIUS, trace
+from nerfloom.renderable import training_poses
+from nerfloom.testing.ball import RADIUS
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.loaded import Loaded
+from tests.exact_ball import ExactBall, colors_of
 from tests.training.helpers import tiny_trainer
 
 MOTION = torch.tensor([0.3, -0.2, 0.4, 0.1, -0.2, 0.15])
@@ -40,42 +38,21 @@ SIZE = 90
 """Width and height of the images, pixels."""
 
 
-class LearntBall(RendersRays):
-    """A ball at the origin, coloured by its normals, that was learnt with one motion of all training cameras."""
-
-    device = torch.device("cpu")
-    rays_at_once = 10_000
+class LearntBall(ExactBall):
+    """A ball that was learnt with one motion of all training cameras."""
 
     def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
         assert scene.camera_to_worlds is not None
-        self.scene = scene
         self.poses = PoseRefinement(scene.num_cameras, "SE3", scene.camera_to_worlds)
         self.poses.tangents.data[:] = MOTION
 
     def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
         return self.poses.refined(poses, training)
 
-    def render(self, rays: Rays, background: Tensor) -> Rendered:
-        normals, hits = trace(rays.origins, rays.directions)
-        depth = ((RADIUS * normals - rays.origins) * rays.directions).sum(-1)
-        depth = torch.where(hits, depth, rays.fars)
-        rgb = torch.where(hits[:, None], colors_of(normals), background)
-        return Rendered(rgb, depth, depth, hits.float(), len(rays))
-
-    def render_view(self, view: View, background: Tensor) -> Picture:
-        pixels = view.pixels()
-        rays = view.camera.pixel_rays(pixels.reshape(-1), self.scene.near, self.scene.far)
-        shown = self.render(rays, background)
-        values = (part.view(pixels.shape) for part in (shown.depth, shown.median_depth, shown.accumulation))
-        return Picture(shown.rgb.view(*pixels.shape, 3), *values)
-
     def density(self, points: Points) -> Tensor:
         """Half of the largest density is on the ball."""
         return 1e4 * (RADIUS + 0.05 - points.positions.norm(dim=-1)).clamp(0, 0.1)
-
-
-def colors_of(normals: Tensor) -> Tensor:
-    return 0.5 + 0.4 * normals.clamp(-1, 1)
 
 
 def moved_back(poses: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ class Fogged(RendersRays):
 
 
 def fogged(**changes: Any) -> Any:
-    """The scene with a reconstruction where each camera sees each point."""
+    """The scene with a reconstruction: each camera sees each point."""
     count, cameras = len(POINTS), some_cameras()
     images = torch.arange(len(cameras)).repeat_interleave(count)
     sightings = Sightings(images, POINTS.repeat(len(cameras), 1), torch.full((count * len(cameras),), 1e-3))

@@ -14,6 +14,7 @@ from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.crop_panel import ARROW
 from tests.cli.helpers import command, train
+from tests.edit.clouds import ball_in_capture
 from tests.patience import until
 from tests.training.helpers import tiny_trainer
 from tests.viewer.chromium import Chromium, Tab
@@ -170,18 +171,38 @@ def test_what_is_shown_is_exported_and_downloaded(browser: Chromium, shared_tiny
     assert region.contains(means).all()
 
 
-def test_floaters_are_counted(browser: Chromium, shared_tiny: Path, tmp_path: Path) -> None:
-    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path / "run", max_num_iterations=60)
-    trainer.train()
-    with started(command("ns-viewer"), trainer.folder, "--websocket-port", 18407) as (_, address):
+def test_floaters_are_counted_and_are_red_points(browser: Chromium, tmp_path: Path) -> None:
+    """One of the ball's Gaussians floats, on the axis of a photograph's camera: in the middle of its picture."""
+    ball = ball_in_capture(tmp_path)
+    assert ball.loaded is not None
+    number = [path.name for path in ball.loaded.parsed("train").image_paths].index("004.png")
+    words = (tmp_path / "ball.ply", "--data", tmp_path / "capture", "--websocket-port", 18407)
+    with started(command("ns-viewer"), *words) as (_, address):
         tab = browser.open(address)
         shown(tab)
         tab.press("Photographs")
+        type_into(tab, "Photograph", 0, str(number))
+        tab.press("Go to the photograph")
+        until(lambda: "004.png" in text_of(tab))
+        before = settled(tab)
         tick(tab, "Show floaters")
         until(lambda: "Gaussians float" in text_of(tab))
+        text, after = text_of(tab), settled(tab)
+        width, height = size_of(tab)
         tick(tab, "Show floaters")
         until(lambda: "Gaussians float" not in text_of(tab))
+        hidden = settled(tab)
         tab.close()
+    assert f"1 of {len(ball)} Gaussians float" in text
+    drawn = np.abs(after.astype(int) - before)[PICTURE].max(-1) > 40
+    rows, columns = drawn.nonzero()
+    assert len(rows) > 20
+    middle = rows.mean() + PICTURE[0].start + 0.5, columns.mean() + PICTURE[1].start + 0.5
+    red, green, blue = after[PICTURE][drawn].mean(0)
+    print(f"{len(rows)} pixels around {middle} of {height} x {width}, colour {red:.0f}, {green:.0f}, {blue:.0f}")
+    np.testing.assert_allclose(middle, (height / 2, width / 2), atol=3)
+    assert red > 150 > 1.5 * max(green, blue)
+    assert np.abs(hidden.astype(int) - before)[PICTURE].max() < 40
 
 
 def test_a_video_has_a_bar_and_is_downloaded(browser: Chromium, run: Path) -> None:

@@ -1,6 +1,7 @@
 """The page of levels of detail: its folder of chunks, and the browser that loads them."""
 
 import json
+import os
 import re
 import threading
 from collections.abc import Iterator
@@ -20,18 +21,19 @@ from nerfloom.cameras.view import View
 from nerfloom.cli.export import main
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.export.levels_page import levels_page
-from nerfloom.export.web import DATA, gaussians_of
+from nerfloom.export.web import BITS, DATA, gaussians_of
 from nerfloom.levels.drawn import DrawnLevels
 from nerfloom.levels.files import LevelsFile
 from nerfloom.levels.settings import DetailSettings
 from nerfloom.splats.drawing import draw_colors, splat_camera
-from nerfloom.splats.spz import read_spz
+from nerfloom.splats.look import OURS
+from nerfloom.splats.spz import encoded, read_spz
 from nerfloom.splats.transform import transformed
 from tests.cli.helpers import called
 from tests.conftest import Refused
 from tests.levels.made import built, cloud, leaves, scene
 from tests.web.helpers import SIZE, some_cameras, some_facts
-from tests.web.test_browser import opened, pictured
+from tests.web.test_browser import message_in, opened, pictured
 
 UPRIGHT = torch.eye(3, dtype=torch.float64)
 
@@ -109,15 +111,20 @@ def hosted(folder: Path) -> Iterator[str]:
         server.server_close()
 
 
-@pytest.fixture
-def page(file: LevelsFile, tmp_path: Path) -> tuple[Path, DrawnLevels]:
-    """A page in the frame of the file, and the levels as we draw them."""
+def exported(file: LevelsFile, path: Path) -> DrawnLevels:
+    """Write a page in the frame of the file; the levels as we draw them."""
     model = DrawnLevels(file, Placement.of(None, 1.0), scene(), torch.device("cpu"), DetailSettings(1.0, 100.0))
     loaded: Any = SimpleNamespace(model=model, origin=file.path)
-    path = tmp_path / "host" / "scene.html"
-    path.parent.mkdir()
+    path.parent.mkdir(exist_ok=True)
     path.write_text(levels_page(loaded, path, some_facts(), UPRIGHT).text, encoding="utf-8")
-    return path, model
+    return model
+
+
+@pytest.fixture
+def page(file: LevelsFile, tmp_path: Path) -> tuple[Path, DrawnLevels]:
+    """A page, and the levels as we draw them."""
+    path = tmp_path / "host" / "scene.html"
+    return path, exported(file, path)
 
 
 @pytest.mark.slow
@@ -149,4 +156,34 @@ def test_from_disk_the_coarsest_level_is_shown_and_why(
 ) -> None:
     dom = opened(browser, tmp_path, f"{page[0].as_uri()}#sort=here", "--dump-dom")
     assert 'data-state="ready"' in dom
-    assert "Only a coarse version is shown" in dom
+    assert message_in(dom).startswith("Only a coarse version is shown: the rest is in the folder “scene”")
+
+
+@pytest.mark.slow
+def test_chunks_of_another_export_are_not_drawn(browser: str, page: tuple[Path, DrawnLevels], tmp_path: Path) -> None:
+    """The browser keeps chunks of an earlier export, which look fresh for a long time; or the host mixes them."""
+    path, _ = page
+    folder, view = path.with_suffix(""), View(some_cameras()[1:2])
+    other = cloud(3000, 2, torch.Generator().manual_seed(1))
+
+    def aged(seconds: int) -> None:
+        for chunk in folder.iterdir():
+            os.utime(chunk, (seconds, seconds))
+
+    with hosted(path.parent) as host:
+        address = f"{host}/scene.html"
+        aged(10**9)
+        first = pictured(browser, SimpleNamespace(as_uri=lambda: address), tmp_path, 1)  # type: ignore[arg-type]
+        model = exported(built(tmp_path / "other.levels", other, 300, memory=2.0), path)
+        aged(10**9 + 60)
+        shot = pictured(browser, SimpleNamespace(as_uri=lambda: address), tmp_path, 1)  # type: ignore[arg-type]
+        fewer = encoded(other[:7], BITS, OURS)
+        for chunk in folder.iterdir():
+            chunk.write_bytes(fewer)
+        dom = opened(browser, tmp_path, f"{address}#camera=1&sort=here", "--dump-dom")
+    own = model.render_rgb(view, torch.ones(3)).clamp(0, 1)
+    print(f"PSNR of the second page {psnr(shot, own):.1f} dB, of the first {psnr(first, own):.1f}")
+    assert psnr(shot, own) > 35
+    assert psnr(first, own) < 25
+    assert 'data-state="ready"' in dom
+    assert message_in(dom).startswith("Only a coarse version is shown: The parts of this page do not fit together")

@@ -18,16 +18,21 @@ from nerfloom.cameras.view import View
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.export.octree_page import make_octree_page, octree_payload
 from nerfloom.export.octree_size import chosen, is_too_fine
+from nerfloom.export.run_page import export_page
+from nerfloom.export.settings import WebSettings
 from nerfloom.export.web import PICTURE, SCRIPTS, page, payload_of
-from nerfloom.kernels.octree.light import error_bound
+from nerfloom.kernels.octree.light import error_bound, raw_of
+from nerfloom.methods.voxels import Voxels
 from nerfloom.octrees.coarser import halved
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.files import write_octree
 from nerfloom.octrees.octree import Octree
+from nerfloom.registry import load_method
+from nerfloom.training.loaded import Loaded
 from tests.cli.helpers import called
 from tests.octrees.balls import ball, grains
 from tests.patience import PATIENCE
-from tests.training.helpers import tiny_trainer
+from tests.training.helpers import TINY, tiny_trainer
 from tests.web.helpers import ASLANT, octree_facts, some_cameras
 from tests.web.test_scripts import PAGE
 
@@ -226,7 +231,26 @@ def test_a_file_of_an_octree_gets_its_page(tmp_path: Path) -> None:
     assert f"{ball().layout.num_leaves // 2:,} leaves" in half.stderr
     wrong = called("ns-export", "web", file, "--output-dir", out, "--kind", "gaussians")
     assert wrong.returncode != 0
-    assert "neither Gaussians nor rays" in wrong.stderr
+    assert "give --data" in wrong.stderr  # an octree has rays, but no cameras to fit Gaussians at
+
+
+@pytest.mark.medium
+def test_the_page_of_a_run_of_voxels_is_its_octree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not asked for, and made smaller as a file's: harmonics go first, and no leaf."""
+    torch.manual_seed(0)
+    octree = ball(depth=0.1)
+    coefficients = octree.leaves.coefficients() + 0.2 * torch.randn(octree.leaves.colors.shape)
+    method = load_method("voxels")
+    model = method.build(replace(method.config, **TINY["voxels"]), replace(octree.scene, near=0.05)).eval()
+    assert isinstance(model, Voxels)
+    model.set_octree(octree.layout, raw_of(octree.leaves.depths())[:, None], coefficients)
+    loaded = Loaded(model, octree.placement, "voxels", tmp_path / "x.ckpt", tmp_path / "x.ckpt")
+    limit = (len(page(b"", octree_facts(UPRIGHT)).encode()) + 35_000) / 1e6
+    export_page(loaded, tmp_path / "x.html", WebSettings(max_megabytes=limit), load_method("gaussian-splatting"))
+    said = capsys.readouterr().err
+    assert "MB hold harmonics of degree 0 instead of 1\n" in said
+    assert f"{octree.layout.num_leaves:,} leaves with harmonics of degree 0" in said
+    assert "baked" not in (tmp_path / "x.html").read_text(encoding="utf-8").split("<noscript>")[0]
 
 
 @pytest.mark.slow

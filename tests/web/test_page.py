@@ -212,13 +212,14 @@ def test_wheels_carry_the_page() -> None:
 
 def test_up_is_up() -> None:
     cameras = some_cameras(3)
-    assert torch.equal(upright(cameras), torch.eye(3).double())
+    assert torch.equal(upright(cameras, False), torch.eye(3).double())
     quarter = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y is up after it
     turned = replace(cameras, camera_to_worlds=quarter.T @ cameras.camera_to_worlds)
-    turn = upright(turned)
+    turn = upright(turned, False)
     up = (turn @ turned.camera_to_worlds[:, :, 1].double().T).mean(1)
     torch.testing.assert_close(up / up.norm(), torch.tensor([0, 0, 1.0]).double())
     torch.testing.assert_close(turn @ turn.T, torch.eye(3).double())
+    assert torch.equal(upright(turned, True), torch.eye(3).double())  # they look down, say
 
 
 def test_cameras_look_at_the_focus() -> None:

@@ -1,6 +1,6 @@
-// Levels of detail: for a view, the coarsest chunks of Gaussians with an error on the screen that is small enough. They
-// are loaded from the folder beside the page, coarse ones first. A coarser chunk above replaces a chunk that is not
-// loaded yet. A chunk is a node of a tree (framework/levels/nodes.py), where each node follows the nodes below it.
+// Levels of detail: for a view, the coarsest chunks of Gaussians whose error on the screen is small enough. They are
+// loaded from the folder beside the page, coarse ones first. What is not there yet is drawn by a coarser chunk above it.
+// A chunk is a node of a tree (framework/levels/nodes.py). Each node follows those below it.
 
 const LEVEL_ERROR = 1; // pixels: largest standard deviation of a merged Gaussian on the screen
 const AT_ONCE = 4; // requests
@@ -19,9 +19,10 @@ function levelsOf(first, facts, here) {
   let changed = () => {}, shown = 0, silent = false, chosen = -EVERY, later = 0;
 
   function keep(node, gaussians) {
-    const place = free.pop();
-    there.set(node, { place, count: gaussians.count });
-    store.add(node, gaussians, place * rows);
+    // A chunk of another export would lie over its neighbours in the table.
+    if (gaussians.count !== tree.counts[node]) throw new Refused("The parts of this page do not fit together. Export the page again.");
+    store.add(node, gaussians, free[free.length - 1] * rows);
+    there.set(node, { place: free.pop(), count: gaussians.count });
   }
 
   /** Make room for a chunk; false if all that is there is needed. */
@@ -42,7 +43,8 @@ function levelsOf(first, facts, here) {
   async function load(node) {
     asked.add(node);
     try {
-      const response = await fetch(`${encodeURIComponent(levels.folder)}/${node}.spz`);
+      // The browser asks whether its copy is still right: an earlier export may have had a chunk of this name.
+      const response = await fetch(`${encodeURIComponent(levels.folder)}/${node}.spz`, { cache: "no-cache" });
       if (!response.ok) throw new Error(`status ${response.status}`);
       const raw = await gunzip(new Uint8Array(await response.arrayBuffer()), options.get("inflate") === "here");
       keep(node, gaussiansOf(raw));
@@ -50,7 +52,7 @@ function levelsOf(first, facts, here) {
     } catch (error) {
       failed.set(node, performance.now());
       setTimeout(() => changed(), WAIT + 100);
-      complain();
+      complain(error);
     } finally {
       asked.delete(node);
     }
@@ -58,13 +60,14 @@ function levelsOf(first, facts, here) {
   }
 
   /** Say once that finer parts cannot be loaded; the coarse ones stay. */
-  function complain() {
+  function complain(error) {
     if (silent) return;
-    if (state.state !== "ready") { setTimeout(complain, EVERY); return; }
+    if (state.state !== "ready") { setTimeout(complain, EVERY, error); return; }
     silent = true;
     const message = element("message");
-    message.textContent = `Only a coarse version is shown: the rest is in the folder “${levels.folder}” beside this page, and` +
-      " could not be loaded. Browsers load it from a web server, not from disk; put both on one.";
+    const why = `the rest is in the folder “${levels.folder}” beside this page, and could not be loaded. Browsers load it` +
+      " from a web server, not from disk; put both on one.";
+    message.textContent = `Only a coarse version is shown: ${error instanceof Refused ? error.message : why}`;
     message.hidden = false;
     canvas.addEventListener("pointerdown", () => { message.hidden = true; }, { once: true });
   }

@@ -69,7 +69,9 @@ def unit_multisamples(frustums: Frustums, pattern: Pattern, box: Tensor, contrac
 UNIT_MULTISAMPLES = Operation("unit_multisamples", unit_multisamples_reference)
 
 
-@UNIT_MULTISAMPLES.implementation(CPP, differentiable=2)
+@UNIT_MULTISAMPLES.implementation(
+    CPP, differentiable=2, fits=lambda frustums, pattern, box, contracted: not frustums.parallel
+)
 def _compiled(frustums: Frustums, pattern: Pattern, box: Tensor, contracted: bool) -> Tensor:
     turned = pattern.turns.cos(), pattern.turns.sin(), pattern.mirrors
     kernels, row = (_multisamples, _multisamples_backward), (NUM_MULTISAMPLES, 4)
@@ -80,7 +82,7 @@ def _compiled(frustums: Frustums, pattern: Pattern, box: Tensor, contracted: boo
 
 def frustum_balls_reference(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
     """Compute `frustum_balls` of `frustums`, `box` and `contracted` in PyTorch, on any device, for any float type."""
-    mean_t, along, across = conical_frustums(frustums.t_starts, frustums.t_ends, frustums.radii)
+    mean_t, along, across = conical_frustums(frustums.t_starts, frustums.t_ends, frustums.radii, frustums.parallel)
     positions = torch.addcmul(frustums.origins, frustums.directions, mean_t[:, None])
     return unit_balls(positions, ball_deviations(along, across), box, contracted)
 
@@ -115,7 +117,7 @@ def frustum_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
 FRUSTUM_BALLS = Operation("frustum_balls", frustum_balls_reference)
 
 
-@FRUSTUM_BALLS.implementation(CPP, differentiable=2)
+@FRUSTUM_BALLS.implementation(CPP, differentiable=2, fits=lambda frustums, box, contracted: not frustums.parallel)
 def _compiled_balls(frustums: Frustums, box: Tensor, contracted: bool) -> Tensor:
     kernels, to_cube = (_balls, _balls_backward), _Map.of(box, contracted, 1.0)
     return _InCube.apply(frustums.origins, frustums.directions, _columns(frustums), (4,), to_cube, kernels)

@@ -31,10 +31,12 @@ shown by the finest level alone."""
 def smallest_cells(rays: Rays) -> Tensor | None:
     """Return the smallest edge (R,) of cells that show each of R rays, per unit of distance.
 
-    It is None if the rays have no `pixel_radii`. A layout of a single grid does not use it.
+    It is None if the rays have no `pixel_radii` or are parallel: the boxes alone then choose the level. A layout of a
+    single grid does not use it.
     """
-    # A pixel's radius is 2 / sqrt(12) of its width.
-    return None if rays.pixel_radii is None else rays.pixel_radii.detach() * (3**0.5 / CELLS_PER_PIXEL)
+    if rays.pixel_radii is None or rays.parallel:
+        return None
+    return rays.pixel_radii.detach() * (3**0.5 / CELLS_PER_PIXEL)  # a pixel's radius is 2 / sqrt(12) of its width
 
 
 def leaf_samples(layout: OctreeLayout, rays: Rays, smallest: Tensor | None = None) -> tuple[Samples, Tensor]:

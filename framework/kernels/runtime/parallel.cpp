@@ -6,13 +6,16 @@
 #include <chrono>
 #include <condition_variable>
 #include <exception>
+#include <functional>
 #include <memory>
 #include <mutex>
-#include <system_error>
-#include <thread>
+#include <utility>
 #include <vector>
 
-#if !defined(_WIN32)
+#if defined(_WIN32)
+#include <system_error>
+#include <thread>
+#else
 #include <pthread.h>
 #include <signal.h>
 #endif
@@ -82,6 +85,44 @@ public:
     }
 };
 
+// Starts a thread that is never joined; false if the system allows no more.
+#if defined(_WIN32)
+// Its stack is as large as the program states, which is 2 MB for Python.
+bool start_thread(std::function<void()> work) {
+    try {
+        std::thread(std::move(work)).detach();
+        return true;
+    } catch (const std::system_error&) {
+        return false;
+    }
+}
+#else
+// Minimum size of a stack, bytes: a chunk of a network takes 540 KB of it. By default, macOS gives threads 512 KiB and
+// musl 128 KiB.
+constexpr size_t STACK = size_t(4) << 20;
+
+extern "C" void* run_thread(void* work) {
+    const std::unique_ptr<std::function<void()>> own(static_cast<std::function<void()>*>(work));
+    (*own)();
+    return nullptr;
+}
+
+bool start_thread(std::function<void()> work) {
+    pthread_attr_t attributes;
+    if (pthread_attr_init(&attributes) != 0) return false;
+    size_t usual = 0;
+    pthread_attr_getstacksize(&attributes, &usual);
+    if (usual < STACK) pthread_attr_setstacksize(&attributes, STACK);
+    pthread_attr_setdetachstate(&attributes, PTHREAD_CREATE_DETACHED);
+    auto handed_over = std::make_unique<std::function<void()>>(std::move(work));
+    pthread_t thread;
+    const bool started = pthread_create(&thread, &attributes, run_thread, handed_over.get()) == 0;
+    if (started) handed_over.release();
+    pthread_attr_destroy(&attributes);
+    return started;
+}
+#endif
+
 class Pool {
     // Remaining work: threads that may take part in the upper half, unstarted chunks in the lower half. A thread that
     // decrements it owns a chunk of the current region, which cannot end before that chunk is done. Until then the
@@ -134,9 +175,7 @@ class Pool {
         while (int(beds.size()) + 1 < threads) {
             beds.emplace_back(new Bed);
             const int slot = int(beds.size());
-            try {
-                std::thread([this, slot] { stay(slot); }).detach();
-            } catch (const std::system_error&) {  // a system limit: fewer threads suffice
+            if (!start_thread([this, slot] { stay(slot); })) {  // fewer threads suffice
                 beds.pop_back();
                 return;
             }

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from nerfloom.geometry.points import radii_at
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, Operation
@@ -109,18 +110,18 @@ def crossings(distance: DistanceFunction, rays: Rays, pieces: Pieces, shortest: 
     unclear = torch.full_like(first, -torch.inf)
     paths = _Paths(active, first, first, was, was * torch.inf, first, unclear, first, first, first)
     span = 2 * (float(pieces.ends.max()) + shortest) if len(active) else 1.0  # one number orders ray and distance
-    ends = pieces.owners * span + pieces.ends.double()
+    ends = pieces.owners.double() * span + pieces.ends
     met, evaluations = [(paths.of(active < 0), first[:0])], 0
     while len(paths.rays):
         value = distance(rays.points(paths.rays, paths.t))
         evaluations += len(value)
-        radius = radii[paths.rays] * paths.t
+        radius = radii_at(paths.t, radii[paths.rays], rays.parallel)
         paths = _noted(paths, value)
         covered = (paths.outside > -torch.inf) & (paths.least <= -radius) | value.isnan()  # a broken field shows
         # The length is at least a few units in the last place, so that a ray far away ends too.
         step = value.abs().clamp(min=shortest).maximum(radius / 2).maximum(4 * torch.finfo(value.dtype).eps * paths.t)
         to = paths.t + step
-        piece = torch.searchsorted(ends, paths.rays * span + to.double(), right=True)
+        piece = torch.searchsorted(ends, paths.rays.double() * span + to, right=True)
         over = piece >= pieces.offsets[paths.rays + 1]
         start = pieces.starts[piece.clamp(max=len(ends) - 1)]
         gap = ~over & (start > to + shortest)
@@ -229,7 +230,7 @@ _take: Callable[..., int] = native.Function("crossings_take", "qqppp", "q")
 def _fits(marched: March, known: SignedDistance, shortest: float, safety: float) -> bool:
     if not isinstance(marched, CompiledMarch) or marched.waves or not is_compiled(known):
         return False
-    return marched.levels == 1 and marched.cone == 0 and marched.slices is None
+    return marched.levels == 1 and marched.cone == 0 and marched.slices is None and not marched.rays.parallel
 
 
 @MARCHED_CROSSINGS.implementation(CPP, order=0, differentiable=0, fits=_fits)

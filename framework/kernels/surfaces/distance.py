@@ -34,11 +34,16 @@ from nerfloom.kernels.triton_backend import later
 
 
 def distance_network_reference(
-    positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout
+    positions: Tensor,
+    table: Tensor,
+    first: Tensor,
+    second: Tensor,
+    layout: HashGridLayout,
+    deferred: TableGradient | None = None,
 ) -> Tensor:
     """Compute `distance_network` in PyTorch, for any device and float type, with derivatives of any order.
 
-    `positions`, `table`, `first`, `second`, `layout` and the result are as in `distance_network`.
+    `positions`, `table`, `first`, `second`, `layout` and the result are as there; `deferred` is not used.
     """
     return _with_gradient(hash_grid_reference, positions, table, first, second, layout)
 
@@ -53,7 +58,8 @@ def _with_gradient(
 ) -> Tensor:
     """Compute `distance_network` by autograd through a form of the grid with the needed derivatives."""
     learns = torch.is_grad_enabled()
-    with torch.enable_grad():
+    # Not in bfloat16, in which distances near the surface have no digits.
+    with torch.enable_grad(), torch.autocast(positions.device.type, enabled=False):
         positions = positions if positions.requires_grad else positions.detach().requires_grad_()
         out = torch.relu(look_up(positions, table, layout) @ first.t()) @ second.t()
         (gradient,) = torch.autograd.grad(out[:, 0].sum(), positions, create_graph=learns)
@@ -107,34 +113,17 @@ def following_positions(
         positions: (N, 3); coordinates are clamped to [0, 1], where the gradient is 0.
         table, first, second, layout: as in `distance_network`.
     """
-    hidden = torch.relu(hash_grid(positions, table.detach(), layout) @ first.detach().t())
-    outputs = hidden @ second.detach().t()
+    with torch.autocast(positions.device.type, enabled=False):  # as the outputs themselves
+        hidden = torch.relu(hash_grid(positions, table.detach(), layout) @ first.detach().t())
+        outputs = hidden @ second.detach().t()
     return torch.nn.functional.pad(outputs - outputs.detach(), (0, 3))
 
 
-def _reference(
-    positions: Tensor,
-    table: Tensor,
-    first: Tensor,
-    second: Tensor,
-    layout: HashGridLayout,
-    deferred: TableGradient | None,
-) -> Tensor:
-    return distance_network_reference(positions, table, first, second, layout)
-
-
-def _fits(
-    positions: Tensor,
-    table: Tensor,
-    first: Tensor,
-    second: Tensor,
-    layout: HashGridLayout,
-    deferred: TableGradient | None,
-) -> bool:
+def _fits(positions: Tensor, table: Tensor, *network: Any, **named: Any) -> bool:
     return table.shape[1] in (1, 2, 4, 8) and not (positions.requires_grad and torch.is_grad_enabled())
 
 
-DISTANCE_NETWORK = Operation("distance_network", _reference)
+DISTANCE_NETWORK = Operation("distance_network", distance_network_reference)
 _forward = native.Function("distance_network_forward", "pqpippipipipi")
 _backward = native.Function("distance_network_backward", "ppqpippipipipppi")
 DISTANCE_NETWORK.implementation(TRITON, fits=_fits)(later("surfaces.distance_triton", "distance_network"))
@@ -147,7 +136,7 @@ def _few_operations(
     first: Tensor,
     second: Tensor,
     layout: HashGridLayout,
-    deferred: TableGradient | None,
+    deferred: TableGradient | None = None,
 ) -> Tensor:
     with derivatives(2):  # a loss on the gradient of the distance needs the grid's second derivatives
         return _with_gradient(hash_grid, positions, table, first, second, layout)
@@ -160,7 +149,7 @@ def _compiled(
     first: Tensor,
     second: Tensor,
     layout: HashGridLayout,
-    deferred: TableGradient | None,
+    deferred: TableGradient | None = None,
 ) -> Tensor:
     contiguous = positions.contiguous(), table.contiguous(), first.contiguous(), second.contiguous()
     return _DistanceNetwork.apply(*contiguous, layout, deferred)

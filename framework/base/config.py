@@ -140,7 +140,8 @@ class TrainConfig:
     object; off: none, masks are not read; auto: empty in formats with masks of an object, and if masks remove over
     half of all pixels and differ between images, else ignored."""
     background: Literal["auto", "random", "white", "black"] = "auto"
-    """Colour behind transparent pixels in training; auto: random if images have alpha. Evaluation: white or black."""
+    """Colour behind transparent pixels in training. auto: random if images have alpha, or if images are opaque and
+    cameras stand in the box, so that every ray ends there. Evaluation: white or black."""
     machine: MachineConfig = field(default_factory=MachineConfig)
     """Seed, device and threads."""
 

@@ -100,6 +100,14 @@ class Scene:
             )
         return scene
 
+    @property
+    def ends_in_box(self) -> bool:
+        """Whether every ray ends at matter in the box: images are opaque, and a training camera stands in the box."""
+        if self.camera_to_worlds is None or self.has_alpha or self.unbounded or self.warped:
+            return False
+        centres = self.camera_to_worlds[..., 3]
+        return bool(((centres > self.box[0]) & (centres < self.box[1])).all(-1).any())
+
     def to(self, device: torch.device | str) -> Scene:
         """Return the scene on `device`."""
         tensors: dict[str, Any] = {

@@ -249,7 +249,7 @@ class ViewSource(BatchSource):
 
 def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource:
     """Return the source of training batches of a `kind` (`Model.batches`) from `dataset`, by `config`."""
-    background = training_background(config.background, dataset.scene.has_alpha)
+    background = training_background(config.background, dataset.scene)
     contradicted = _contradicted(kind, dataset, config)
     if kind == "views":
         return ViewSource(dataset, background, config.machine.seed, contradicted)

@@ -115,8 +115,9 @@ def profile_of(
         reason = f"they {'remove over half of the pixels, and differ between photographs' if cut else 'show an object'}"
         decisions.append(Decision("masks", "masked-out pixels are empty", f"{reason} (else: --masks ignored or off)"))
     if config.background == "auto":
-        reason = f"{'the photographs have' if scene.has_alpha else 'no photograph has'} alpha"
-        decisions.append(Decision("background", training_background(config.background, scene.has_alpha), reason))
+        reason = "every ray ends in the box" if scene.ends_in_box else "no photograph has alpha"
+        reason = "the photographs have alpha" if scene.has_alpha else reason
+        decisions.append(Decision("background", training_background(config.background, scene), reason))
     if config.silhouette_cells and parts(model, Carved):
         obstacle = _no_hull(dataset)
         outside = "what is outside all of them" if scene.moving else "space outside them"

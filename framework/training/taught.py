@@ -226,7 +226,7 @@ def batch_source(model: Model[Any], dataset: Dataset, config: TrainConfig) -> Ba
         model.take_teacher(teacher)
     if not config.teacher_share * config.teacher_until:
         return photographs
-    background = training_background(config.background, dataset.scene.has_alpha)
+    background = training_background(config.background, dataset.scene)
     taught: BatchSource = TaughtPixels(teacher, dataset, background)
     if model.batches == "views":
         taught = TaughtViews(teacher, dataset, background, config.machine.seed)

@@ -13,6 +13,7 @@ from nerfloom.cameras.cameras import CENTER
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.depths import ray_distances
+from nerfloom.data.scene import Scene
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native
 from nerfloom.kernels.argument_checks import check_indices
@@ -90,11 +91,19 @@ class ViewBatch:
         return self.rgb.shape[0] * self.rgb.shape[1]
 
 
-def training_background(asked: Background | Literal["auto"], has_alpha: bool) -> Background:
-    """Return the background in training: the `asked` one, or for "auto" random if `has_alpha`, else black."""
+def training_background(asked: Background | Literal["auto"], scene: Scene) -> Background:
+    """Return the background in training: the `asked` one, or for "auto" random or black.
+
+    Where images have alpha, a fixed background could be learnt as matter. Where every ray ends in the box, a fixed one
+    could stand for dark matter, and fog before a camera need not be opaque.
+
+    Args:
+        asked: the setting.
+        scene: facts about the data.
+    """
     if asked != "auto":
         return asked
-    return "random" if has_alpha else "black"
+    return "random" if scene.has_alpha or scene.ends_in_box else "black"
 
 
 def background_colors(kind: Background, count: int, device: torch.device) -> Tensor:

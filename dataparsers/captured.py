@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -67,11 +68,10 @@ def captured_scene(
     images = images[existing_files(images.paths, split)]
     if images.region is not None and images.masks is not None:
         images = images[_with_mask(images, split)]
-    names = list(images.names)
-    chosen = held_out(names, split, flags.eval_interval) if division is None else division(names)
+    chosen = (division or partial(held_out, split=split, every=flags.eval_interval))(list(images.names))
     if len(chosen) == 0:
         raise DataError(
-            f"{images.folder}: split '{split}' has none of the {len(names)} images; "
+            f"{images.folder}: split '{split}' has none of the {len(images.names)} images; "
             "--eval-interval 0 uses all in every split"
         )
     placement = placement_of(flags, images, split, applied)

@@ -44,7 +44,7 @@ def moving_trainer(name: str, data: Path, folder: Path, **changes: Any) -> Train
         pixels=torch.cat([red, blue]),
         cameras=still.cameras[torch.arange(count).repeat(2)],
         times=torch.tensor([0.0, 1.0]).repeat_interleave(count),
-        names=still.names * 2,
+        paths=still.paths * 2,
         scene=dataclasses.replace(still.scene, moving=True, num_cameras=2 * count),
     )
     (folder / "run").mkdir()

@@ -107,7 +107,8 @@ def test_frustums_without_length_and_without_end_are_finite_with_finite_gradient
 def test_in_evaluation_each_second_pattern_is_the_mirror_image_turned_by_30_degrees() -> None:
     one = frustums(0.3)
     twice = Frustums(
-        *(torch.stack([x[3], x[3]]) for x in vars(one).values() if x is not None), ranks=torch.tensor([4, 5])
+        *(torch.stack([x[3], x[3]]) for x in vars(one).values() if isinstance(x, torch.Tensor)),
+        ranks=torch.tensor([4, 5]),
     )
     positions, _ = multisamples(twice, fixed_pattern(twice))
     _, first, second = frames(twice.directions).unbind(-1)

@@ -73,7 +73,8 @@ def test_a_source_is_made_as_the_model_asks(images: Dataset) -> None:
     views, pixels = (make_source(kind, images, config) for kind in ("views", "pixels"))
     assert isinstance(views, ViewSource)
     assert isinstance(pixels, PixelSource)
-    assert views.background == pixels.background == ("random" if images.scene.has_alpha else "black")
+    assert images.scene.has_alpha or images.scene.ends_in_box
+    assert views.background == pixels.background == "random"
 
 
 def test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set(images: Dataset) -> None:

@@ -140,7 +140,13 @@ EXPORTING = {
 
 
 def command_answer(flag: str, answers: Mapping[str, str], command: str) -> str | None:
-    """Return the answer to a `flag` of a `command` of nerfstudio, possibly with =VALUE; None for other words."""
+    """Return the answer to a `flag` of a `command` of nerfstudio; None for other words.
+
+    Args:
+        flag: a word of the command line, possibly with =VALUE.
+        answers: `RENDERING` or `EXPORTING`.
+        command: name of the command.
+    """
     name = flag.removeprefix("--").partition("=")[0].replace("_", "-")
     answer = answers.get(name.partition(".")[0]) if flag.startswith("--") else None
     return None if answer is None else f"--{name} is of nerfstudio's {command}; {answer}"

@@ -276,8 +276,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     """
     cameras, light = parsed.cameras, None if decoded.pixels.shape[1] == 4 else decoded.light
     parsed, kept, opaque = _with_masks(parsed, None if masks == "off" else decoded.kept, masks)
-    names = tuple(path.name for path in parsed.image_paths)
-    visible = pixels_with_rays(cameras, names, split)
+    visible = pixels_with_rays(cameras, tuple(path.name for path in parsed.image_paths), split)
     if visible is not None:
         kept = visible if kept is None else PixelSet.shared([kept, visible], 2)
         if not len(kept):

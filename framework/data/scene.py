@@ -102,7 +102,10 @@ class Scene:
 
     @property
     def ends_in_box(self) -> bool:
-        """Whether every ray ends at matter in the box: images are opaque, and a training camera stands in the box."""
+        """Return whether every ray ends in the box.
+
+        This is so if images are opaque, a training camera stands in the box, and nothing is outside it.
+        """
         if self.camera_to_worlds is None or self.has_alpha or self.unbounded or self.warped:
             return False
         centres = self.camera_to_worlds[..., 3]

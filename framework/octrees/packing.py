@@ -40,7 +40,8 @@ def packed(depths: Tensor, coefficients: Tensor, bits: int = 8) -> tuple[PackedL
         coefficients: (L, 3 K) coefficients of the harmonics.
         bits: number of bits of a value, at most 8; fewer take the same memory and show the loss.
 
-    Returns: The leaves, and their losses.
+    Returns:
+        The leaves, and their losses.
     """
     steps = 2**bits - 1
     codes, table = packed_depths(depths, bits)

@@ -208,9 +208,8 @@ def test_the_spec_is_an_entry_point() -> None:
     assert specs == {"nerfloom": "nerfloom.integrations.nerfbaselines_spec"}
 
 
-@pytest.mark.parametrize("document", ["docs/guides/comparing.md", "docs/plugins.md"])
-def test_documents_name_every_method(document: str) -> None:
-    text = (ROOT / document).read_text(encoding="utf-8")
+def test_the_page_names_every_method() -> None:
+    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     assert [spec["id"] for spec in SPECS if f"`{spec['id']}`" not in text] == []
 
 

@@ -154,7 +154,8 @@ def ray_arguments(rays: Rays) -> tuple[Any, ...]:
 def contiguous(rays: Rays) -> Rays:
     """Return origins, directions and ends of `rays`, contiguous and without gradient."""
     fields = (rays.origins, rays.directions, rays.nears, rays.fars)
-    return Rays(*(values.detach().contiguous() for values in fields))
+    origins, directions, nears, fars = (values.detach().contiguous() for values in fields)
+    return Rays(origins, directions, nears, fars)
 
 
 def outputs_of(rays: Rays) -> tuple[OctreeLight, tuple[int, ...]]:

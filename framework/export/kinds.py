@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from nerfloom.training.loaded import Loaded
 
     Writer = Callable[[Loaded, Path, Any, Sequence[Region]], None]
-    """Function of what is exported, the file, settings and regions that writes the file."""
+    """Function that writes a file, of the scene to export, the file, settings and regions."""
 
 MESHES = (".ply", ".obj", ".glb")
 """Suffixes of meshes."""

@@ -33,7 +33,7 @@ def visible(peaks: Tensor, least: float, most: int) -> Tensor:
     A ray over colours in [0, 1] changes by at most the sum of the weights that the dropped leaves have on it.
 
     Args:
-        peaks: (L,) largest weight of each leaf on training rays, or `UNMET`, with which it stays.
+        peaks: (L,) largest weight of each leaf on training rays, or `UNMET`; such leaves stay.
         least: smallest weight of a visible leaf. If no leaf has it, nothing is known yet, and all qualify.
         most: maximum number of leaves; those with the largest weights stay.
     """

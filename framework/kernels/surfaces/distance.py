@@ -58,7 +58,7 @@ def _with_gradient(
 ) -> Tensor:
     """Compute `distance_network` by autograd through a form of the grid with the needed derivatives."""
     learns = torch.is_grad_enabled()
-    # Not in bfloat16, in which distances near the surface have no digits.
+    # Not in bfloat16: its 8 bits are too few for distances near the surface.
     with torch.enable_grad(), torch.autocast(positions.device.type, enabled=False):
         positions = positions if positions.requires_grad else positions.detach().requires_grad_()
         out = torch.relu(look_up(positions, table, layout) @ first.t()) @ second.t()

@@ -41,10 +41,6 @@ def taken_away(values: Tensor) -> Tensor:
         return to_float64(values)
 
 
-COVERED = ("vanilla-nerf+occupancy", "nerf-w+frequency", "nerf-plus-plus+hash-grid", "volsdf+frequency")
-"""Kinds of methods whose samplers, encodings and surfaces are all parts of others, too."""
-
-
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch alone, as on a device that the kernels do not know."""
@@ -64,7 +60,7 @@ def test_the_watch_sees_float64() -> None:
 
 @pytest.mark.medium
 @pytest.mark.usefixtures("alone")
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=pytest.mark.slow) if k in COVERED else k for k in TINY])
+@pytest.mark.parametrize("kind", TINY)
 def test_a_step_of_each_method(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     """And the silhouettes, the schedule, and a picture with its PSNR and SSIM."""
     settings = {"max_num_iterations": 2, "steps_per_eval_all_images": 2, "max_eval_images": 1}

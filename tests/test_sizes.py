@@ -66,13 +66,11 @@ def test_all_methods_are_here() -> None:
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", METHODS)
-def test_each_number_makes_a_model_or_one_line(method: str, every: bool) -> None:
-    """A setting's values in turn for one scene and for the other, or each for both."""
+def test_each_number_makes_a_model_or_one_line(method: str) -> None:
     config, refused, built = tiny_config(method), set(), set()
-    for index, (name, value) in enumerate(numbers(config)):
-        for scene in KINDS if every else (KINDS[index % 2],):
+    for name, value in numbers(config):
+        for scene in KINDS:
             try:
                 load_method(method).build(dataclasses.replace(config, **{name: value}), scene)
                 built.add(name)

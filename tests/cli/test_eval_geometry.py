@@ -27,7 +27,7 @@ pytest.importorskip("skimage")
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer points than the default, so that the tests are quick."""
-    monkeypatch.setattr("nerfloom.evaluation.geometry.NUM_POINTS", 10_000)
+    monkeypatch.setattr("nerfloom.evaluation.geometry.NUM_POINTS", 20_000)
 
 
 @pytest.fixture(scope="module")

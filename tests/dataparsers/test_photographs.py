@@ -97,7 +97,7 @@ def test_distractors_cover_the_wanted_share(share: float) -> None:
     poses = courtyard_poses("train", 24, 1)
     covered = []
     for pose, people in zip(poses, crowds(poses, share, 1), strict=True):
-        covered.append(float((visible_parts(pose, (60, 60), {**COURTYARD, **people})[1] >= len(COURTYARD)).mean()))
+        covered.append(float((visible_parts(pose, (100, 100), {**COURTYARD, **people})[1] >= len(COURTYARD)).mean()))
     print(
         f"wanted {share:.2f}: {np.mean(covered):.4f} on average, {min(covered):.2f} to {max(covered):.2f} in an image"
     )

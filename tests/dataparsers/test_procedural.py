@@ -31,7 +31,7 @@ def camera_rays(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("time", [0.0, 0.37])
 def test_hits_lie_where_outside_turns_inside(time: float) -> None:
-    origins, directions = camera_rays(8000)
+    origins, directions = camera_rays(20000)
     found = trace(origins, directions, time)
     hit = found.hit
     assert 0.3 < hit.double().mean() < 0.99

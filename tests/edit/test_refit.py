@@ -34,9 +34,8 @@ def test_what_is_left_looks_more_like_all_of_them(tmp_path: Path) -> None:
     assert after < 0.7 * before
     moved = (refitted.gaussians.means - fewer.gaussians.means).norm(dim=-1)
     assert float(moved.max()) < 0.2 * 0.5  # the ball's radius
-    one, other = (edit.reduce_to(whole, 150, refit_steps=40).gaussians.means for _ in range(2))
-    assert torch.equal(one, other)
-    assert not torch.equal(one, fewer.gaussians.means)
+    again = edit.reduce_to(whole, 150, refit_steps=500)
+    assert torch.equal(again.gaussians.means, refitted.gaussians.means)
 
 
 def test_refitting_needs_photographs() -> None:

@@ -14,7 +14,7 @@ from nerfloom.testing.ball import cameras_at
 from tests.evaluation.surfaces import sphere, square, together
 
 pytest.importorskip("trimesh")
-COUNT = 10_000
+COUNT = 20_000
 HERE = Placement(torch.eye(4, dtype=torch.float64)[:3], 1.0)
 
 

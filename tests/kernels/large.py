@@ -164,7 +164,7 @@ def differentiable() -> dict[str, tuple[Callable[..., Tensor], Callable[..., Ten
             gaussians(COUNT // 4),
             RECORD,
         ),
-        "blended Gaussians": (on_image(blend), on_image(blend_reference), [wide_records(1100)], 5),
+        "blended Gaussians": (on_image(blend), on_image(blend_reference), [wide_records(2000)], 5),
         "similarity": (
             lambda x: ssim(x, target)[None, None],
             lambda x: ssim_reference(x, target.double())[None, None],

@@ -95,7 +95,7 @@ def test_pictures_are_those_of_all_gaussians(tmp_path: Path) -> None:
 
 @needs_kernels
 @pytest.mark.medium
-@pytest.mark.parametrize("strategy", ["adc", "mcmc", pytest.param("relocation", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", "relocation"])
 def test_a_run_grows_and_goes_on_with_the_same_bits(
     strategy: str, shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -438,7 +438,7 @@ def test_a_run_starts_anywhere_and_refuses_a_hull(moving_data: Path, tmp_path: P
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("strategy", ["adc", "mcmc", pytest.param("relocation", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", "relocation"])
 def test_a_run_goes_on_with_the_same_bits(strategy: str, moving_data: Path, tmp_path: Path) -> None:
     settings = {"strategy": strategy, "steps_per_reset": 20, "max_num_iterations": 60}
     whole, parts, resumed = (trainer_on(moving_data, tmp_path / str(number), **settings) for number in range(3))

@@ -38,12 +38,8 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-FEWER = (*COVERED, "plain", "marched voxels")
-"""Cases that others contain: "captures" has all of "plain", and "marched voxels" is "tensorf" sampled as "marched"."""
-
-
 @pytest.mark.medium
-@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in FEWER else c for c in CASES])
+@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow) if c in COVERED else c for c in CASES])
 def test_every_method_trains_and_renders_there(case: str, tmp_path: Path) -> None:
     here = small(tmp_path, **CASES[case])
     with other_device():

@@ -1,12 +1,13 @@
-"""Files of results: one JSON file per table, with its `rows` by name."""
+"""Files of results: one JSON file per table, with its `rows` by name and one line per row."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.json_files import write_json
 from nerfloom.comparison.measures import read_json
 
 
@@ -25,10 +26,16 @@ def read_rows(file: Path) -> dict[str, Any]:
 
 
 def add_row(file: Path, name: str, result: Any) -> None:
-    """Write plain data `result` as the row `name` of a JSON `file`, which is created with its folder if missing.
+    """Write finite plain data `result` as the row `name` of a JSON `file`.
+
+    The file and its folder are created if missing. A row is one line, so a difference between two versions of the file
+    names the rows that changed.
 
     Raises:
         ConfigError: if the file exists and holds something else.
+        ValueError: if `result` holds a number that is not finite.
     """
+    rows = sorted({**read_rows(file), name: result}.items())
+    lines = ",\n".join(f"{json.dumps(each)}: {json.dumps(row, allow_nan=False)}" for each, row in rows)
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_json(file, {"rows": dict(sorted({**read_rows(file), name: result}.items()))})
+    write_atomically(file, lambda opened: opened.write(f'{{"rows": {{\n{lines}\n}}}}\n'.encode()))

@@ -308,6 +308,20 @@ def test_figures_of_surfaces_are_kept_and_shown(
     assert estimate(known["solids-planes-10s"], done) == LOADING + 10 + 16 / 4 + 70  # images and surface
 
 
+def test_a_row_is_a_line(tmp_path: Path) -> None:
+    file = tmp_path / "results" / "table.json"
+    rows: dict[str, Any] = {name: {"results": {"psnr": 30.0, "of each": [1.5, None]}} for name in ("planes", "ngp")}
+    for name, row in rows.items():
+        add_row(file, name, row)
+    assert json.loads(file.read_text()) == {"rows": rows}
+    first, ngp, planes, last = file.read_text().splitlines()
+    assert (first, last) == ('{"rows": {', "}}")
+    assert json.loads(f"{{{ngp.rstrip(',')}, {planes}}}") == rows
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        add_row(file, "planes", {"results": {"psnr": float("nan")}})
+    assert json.loads(file.read_text()) == {"rows": rows}
+
+
 def test_what_is_no_file_of_results_is_kept(tmp_path: Path) -> None:
     file = tmp_path / "table.json"
     file.write_text('{"rows": [')

@@ -10,6 +10,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+INPUTS := pyproject.toml setup.py constraints.txt $(wildcard framework/kernels/*/*.cpp framework/kernels/*/*.h)
 
 .PHONY: demo test test-fast test-all mutants lint docs sanitize release-check test-versions clean
 
@@ -55,15 +56,16 @@ test-versions: .venv/installed-release
 	$(PYTHON) -m venv .venv
 
 # Quick: with the kernels of this processor alone, and without compiling modules that nobody imports.
-.venv/installed: .venv/bin/python pyproject.toml setup.py constraints.txt $(wildcard framework/kernels/*/*.cpp framework/kernels/*/*.h)
+.venv/installed: .venv/bin/python $(INPUTS)
 	@echo "installing nerfloom into .venv"
 	$(PIP) --no-compile -e .
 	@touch $@
 
-.venv/installed-test: .venv/installed
-	@echo "installing the test extra into .venv"
-	NERFLOOM_VARIANTS=all $(PIP) -e '.[test]'
-	@touch $@
+# All that `.venv/installed` has, in one installation: two would compile the kernels of this processor twice.
+.venv/installed-test: .venv/bin/python $(INPUTS)
+	@echo "installing nerfloom and the test extra into .venv"
+	NERFLOOM_VARIANTS=all $(PIP) --no-compile -e '.[test]'
+	@touch .venv/installed $@
 
 .venv/installed-release: .venv/installed-test
 	@echo "installing the release extra into .venv"

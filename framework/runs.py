@@ -109,8 +109,7 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
     config = from_plain(load_method(method).config, {**settings, "data": _text(folder)}, "train()")
     config = limited_as_given(config, settings)
     run = Run(method, config, name, parser, run_folder(method, config))
-    start(run)
-    return load(run.folder, device=config.machine.device_type)
+    return load(start(run).folder, device=config.machine.device_type)
 
 
 def _path(given: str | Path | None) -> Path | None:

@@ -12,7 +12,9 @@ import pytest
 import torch
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
+from rich.console import Console
 
+from nerfloom.base import console
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.dataset import load_dataset
@@ -61,6 +63,13 @@ def test_exposures_are_read_in_stops(tmp_path: Path) -> None:
     found = exposures_of(taken)
     assert found is not None
     assert found.tolist() == pytest.approx([s - sum(stops) / 4 for s in stops], abs=1e-6)
+
+
+def test_progress_is_shown_while_exposures_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Console(force_terminal=True, width=120, record=True, stderr=True, _environ={})
+    monkeypatch.setattr(console, "console", terminal)
+    assert read_taken([tmp_path / "missing.jpg"] * 3) == (Taken(),) * 3
+    assert "Reading exposures" in terminal.export_text()
 
 
 def test_what_is_missing_or_damaged_is_unknown(tmp_path: Path) -> None:

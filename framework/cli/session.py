@@ -33,7 +33,7 @@ from nerfloom.training.lock import sole_user
 from nerfloom.training.machine import kernels
 from nerfloom.training.outcome import Outcome
 from nerfloom.training.report import SUMMARY, write_evaluation, write_summary
-from nerfloom.training.run import Run, create_folder, write_report, write_transforms
+from nerfloom.training.run import Run, create_folder, with_own_folder, write_report, write_transforms
 from nerfloom.training.skipping import as_plain, lines, skip_report
 from nerfloom.training.trainer import BetweenSteps, Trainer
 
@@ -45,8 +45,8 @@ FEW_PIXELS = 16
 """Warn if the images' longer side is shorter than this, pixels."""
 
 
-def start(run: Run) -> None:
-    """Train and evaluate a new `run`.
+def start(run: Run) -> Run:
+    """Train and evaluate a new `run`, and return it with its settings and its folder.
 
     Raises:
         Stopped: if a signal ends it; the message names the saved checkpoint.
@@ -57,11 +57,14 @@ def start(run: Run) -> None:
         run = replace(run, config=trainer.config)  # with open settings filled in
         if not several.first:
             _follow(trainer)
-            return
+            return run
         trainer.restore_as_configured()
+        run = with_own_folder(run)
+        trainer.folder = trainer.held_out.folder = run.folder
         with sole_user(run.folder):
             create_folder(run)
             _finish(run, trainer)
+        return run
 
 
 def resume(run: Run) -> None:
@@ -107,8 +110,6 @@ def _prepare(run: Run) -> Trainer:
         say(line)
     if train_set.scene.image_size < FEW_PIXELS:
         say(f"warning: images of {train_set.scene.image_size} pixels are too small to learn from; are they thumbnails?")
-    by_images = isinstance(trainer.model, StartsFromImages)
-    say(f"{'' if by_images else f'{trainer.model.size():,} parameters; '}writing to {run.folder}")
     return trainer
 
 
@@ -140,6 +141,8 @@ def _train(trainer: Trainer, between_steps: BetweenSteps | None = None) -> Outco
 
 
 def _finish(run: Run, trainer: Trainer) -> None:
+    by_images = isinstance(trainer.model, StartsFromImages)
+    say(f"{'' if by_images else f'{trainer.model.size():,} parameters; '}writing to {run.folder}")
     # Also for a resumed run, which may have been killed before writing it.
     write_transforms(run, trainer.train_set)
     profile = run.folder / "scene_profile.json"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from nerfloom.base.errors import ConfigError
+from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.extras import install_command
 from nerfloom.base.machine_config import ViewerConfig
 from nerfloom.cli.common import run_command, with_format, with_run
@@ -21,7 +21,8 @@ class ViewerFlags(RunFlags):
     beside: Path | None = None
     """A second run or file of the same data, shown right of a divider. The flag's name may be omitted."""
     while_moving: Path | None = None
-    """A faster file of the same scene, such as its octree, drawn while the camera moves. At rest, the run is drawn."""
+    """A faster file of the same scene, such as its octree, drawn while the camera moves. At rest, the run is drawn. Not
+    with --beside."""
     websocket_host: str = ViewerConfig.websocket_host
     """Interface to listen on; 0.0.0.0: all, so that other machines can connect. There is no password."""
     websocket_port: int = ViewerConfig.websocket_port
@@ -37,6 +38,8 @@ def _command(arguments: list[str]) -> None:
     words, named = with_format("ns-viewer", with_run([_without_prefix(word) for word in arguments]))
     words = with_run(words, flag="--beside")
     flags = read_flags(ViewerFlags, "ns-viewer", words, takes=f"{OPENS} [{OPENS}]")
+    if flags.beside is not None and flags.while_moving is not None:
+        raise FlagError(f"--while-moving {flags.while_moving}: runs side by side have no faster file; leave one out")
     if (command := install_command("viewer")) is not None:
         raise ConfigError(f"the viewer needs viser: {command}")
     other = None if flags.beside is None else replace(flags, load_config=flags.beside, load_checkpoint=None)

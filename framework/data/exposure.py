@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from nerfloom.base.console import track
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.image_files import read_heif
 
@@ -55,7 +56,7 @@ def read_taken(paths: Sequence[Path]) -> tuple[Taken, ...]:
         paths: image files; some may be missing.
     """
     with ThreadPoolExecutor() as pool:
-        return tuple(pool.map(_read_exif, paths))
+        return tuple(track(pool.map(_read_exif, paths), "Reading exposures", total=len(paths)))
 
 
 def exposures_of(taken: Sequence[Taken] | None) -> Tensor | None:

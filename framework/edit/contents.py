@@ -55,7 +55,7 @@ def reduce_to(edited: Edited, count: int, refit_steps: int = 0) -> Edited:
     Args:
         count: maximum number of Gaussians.
         refit_steps: number of training steps that make the kept Gaussians look like all of them, from the cameras of
-            the training images; 0 for none.
+            the training images; 0 for none. If all are kept, none are refitted.
 
     Raises:
         ConfigError: if Gaussians cannot be drawn for the cameras of the photographs, or refitting lacks photographs.
@@ -63,6 +63,8 @@ def reduce_to(edited: Edited, count: int, refit_steps: int = 0) -> Edited:
     if refit_steps:
         edited.photographed("refit_steps")
     if count >= len(edited):
+        if refit_steps:
+            say(f"reduce_to: all {len(edited):,} Gaussians are kept, so nothing is refitted")
         return edited
     if edited.has_photographs:
         loaded = edited.photographed("reduce_to")

@@ -1,10 +1,12 @@
 """The web page of a file of levels, and the folder of chunks beside it, which the page loads for a view.
 
-The folder has the name of the page without suffix. Its file N.spz holds the Gaussians of node N of the tree
-(`levels/nodes.py`) in the frame of the page, as SPZ of version 2 with 8 bits of harmonics. The page itself holds the
-Gaussians of the root, and of the tree
+The folder has the name of the page without suffix. It has a file for each node of the tree (`levels/nodes.py`), with
+the node's Gaussians in the frame of the page, as SPZ of version 2 with 8 bits of harmonics. The file is named after its
+content, so chunks of another export do not replace those of a page that is being read, or that stays because its export
+is stopped. The page itself holds the Gaussians of the root, and of the tree
 
     folder, total, largest     name of the folder; Gaussians of the scene; most Gaussians of a chunk
+    chunks                     of each node: name of its file without suffix
     counts, parents            of each node, as in the file
     boxes                      of each node: minimum and maximum corner of a box of its Gaussians and of those below
     reach, errors              of each node, as in the file
@@ -14,6 +16,8 @@ Lengths are in the unit of the page. Any static host can serve both: no program 
 
 from __future__ import annotations
 
+import hashlib
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import track
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.view import View
@@ -35,10 +40,12 @@ from nerfloom.training.loaded import Loaded
 
 DIGITS = 6
 """Significant digits of lengths in the page."""
+NAME = re.compile(r"[0-9]+|[0-9a-f]{16}")
+"""Names of chunks without suffix: numbers in older pages, and digests."""
 
 
 def levels_page(loaded: Loaded, path: Path, facts: PageFacts, turn: Tensor) -> ScenePage:
-    """Write the chunks of a file of levels beside a page, and return the page.
+    """Write the chunks of a file of levels beside a page, and return the page. Other chunks stay.
 
     Args:
         loaded: the file of levels.
@@ -58,20 +65,18 @@ def levels_page(loaded: Loaded, path: Path, facts: PageFacts, turn: Tensor) -> S
     rotation, scale, shift = model.placement.similarity()
     rotation, shift = turn @ rotation, turn @ shift
     folder.mkdir(exist_ok=True)
-    content, size, lossy = b"", 0, list[str]()
+    content, size, chunks, lossy = b"", 0, list[str](), list[str]()
     for index in track(range(len(file.nodes)), "Writing chunks", total=len(file.nodes)):
         chunk = transformed(file.read(index), rotation, scale, shift)
         content = encoded(chunk, BITS, file.look)
-        (folder / f"{index}.spz").write_bytes(content)
+        chunks.append(_write(folder, content))
         size += len(content)
         lossy += out_of_range(chunk)[:1]
-    for other in folder.glob("*.spz"):  # of an earlier page
-        if other.stem.isdecimal() and int(other.stem) >= len(file.nodes):
-            other.unlink()
     levels = {
         "folder": folder.name,
         "total": file.num_gaussians,
         "largest": int(file.nodes.counts.max()),
+        "chunks": chunks,
         **tree_facts(file.nodes, rotation, scale, shift),
     }
     text = page(content, replace(facts, look=file.look, levels=levels))
@@ -80,7 +85,28 @@ def levels_page(loaded: Loaded, path: Path, facts: PageFacts, turn: Tensor) -> S
         f"folder {folder.name} beside it"
     )
     costs = [f"{len(lossy):,} of the chunks lose more than others, the first: {lossy[0]}"] if lossy else []
-    return ScenePage(text, words, costs, lambda camera: model.render_rgb(View(camera), model.background), DRAWN)
+    return ScenePage(
+        text, words, costs, lambda camera: model.render_rgb(View(camera), model.background), DRAWN, frozenset(chunks)
+    )
+
+
+def remove_other_chunks(path: Path, page: ScenePage) -> None:
+    """Remove the chunks of earlier pages.
+
+    Args:
+        path: path of the page, which has been written.
+        page: the page.
+    """
+    for file in path.with_suffix("").glob("*.spz"):
+        if NAME.fullmatch(file.stem) and file.stem not in page.chunks:
+            file.unlink()
+
+
+def _write(folder: Path, content: bytes) -> str:
+    """Write a chunk, and return its name without suffix."""
+    name = hashlib.sha256(content).hexdigest()[:16]
+    write_atomically(folder / f"{name}.spz", lambda file: file.write(content))
+    return name
 
 
 def tree_facts(nodes: Nodes, rotation: Tensor, scale: float, shift: Tensor) -> dict[str, Any]:

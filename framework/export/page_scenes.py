@@ -42,6 +42,8 @@ class ScenePage:
     """Function from one camera in the scene's frame, on the model's device, to the colours (H, W, 3) that it sees."""
     lenses: Container[str]
     """Camera models that `draw` takes."""
+    chunks: frozenset[str] = frozenset()
+    """Names without suffix of the files beside the page that it loads."""
 
 
 def gaussian_page(

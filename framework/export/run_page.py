@@ -18,7 +18,7 @@ from nerfloom.evaluation.images import to_uint8
 from nerfloom.evaluation.paths import around
 from nerfloom.evaluation.videos import write_images
 from nerfloom.export.bake import Baking, bake
-from nerfloom.export.levels_page import levels_page
+from nerfloom.export.levels_page import levels_page, remove_other_chunks
 from nerfloom.export.page_closeness import closeness
 from nerfloom.export.page_scenes import BEYOND_THE_BOX, ScenePage, gaussian_page, octree_page
 from nerfloom.export.settings import WebSettings
@@ -112,12 +112,19 @@ def export_page(
         picture = to_uint8(page.draw(camera))
     write_images([path.with_suffix(PICTURE_SUFFIX)], [picture])
     content = with_still(page.text, picture, settings.max_megabytes).encode("utf-8", "replace")
-    write_atomically(path, lambda file: file.write(content))
+    _write(path, page, content)
     say(f"{len(content) / 1e6:.2f} MB, {page.words}: {path}")
     if moment is not None:
         say(f"the scene moves, and the page shows it at time {moment:g}, still")
     if not regions and kind != "levels":
         _say_closeness(loaded, page, dataset, cameras, moment)
+
+
+def _write(path: Path, page: ScenePage, content: bytes) -> None:
+    """Write a page and, if it has chunks of its own, remove those of earlier pages."""
+    write_atomically(path, lambda file: file.write(content))
+    if page.chunks:
+        remove_other_chunks(path, page)
 
 
 def kind_of(model: Renderable) -> str:

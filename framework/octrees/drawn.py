@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from nerfloom.base.device import runs_ahead
 from nerfloom.cameras.cameras import subpixels
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
@@ -77,12 +78,13 @@ class DrawsOctree(RendersRays):
             background: (R, 3) or (3,) colour in [0, 1] of the background.
         """
         light = self.light(rays, background, self.early_stop / self.largest)
+        visits = light.visits.sum()
         return Rendered(
             rgb=light.color,
             depth=mean_distance(light.moment, light.opacity.detach(), rays.fars),
             median_depth=light.median,
             accumulation=light.opacity,
-            num_samples=int(light.visits.sum()),
+            num_samples=visits if torch.is_grad_enabled() and runs_ahead(visits.device) else int(visits),
             extras={LEAVES.name: light.visits.float()},
             error_bound=self.early_stop,
         )

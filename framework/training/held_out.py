@@ -37,7 +37,7 @@ class HeldOut:
     """
 
     def __init__(self, config: TrainConfig, model: Model[Any], dataset: Dataset | None, folder: Path | None) -> None:
-        self.config, self.model, self._given, self._folder = config, model, dataset, folder
+        self.config, self.model, self._given, self.folder = config, model, dataset, folder
         self.load_all: Callable[[], Dataset | None] | None = None
         """Loads all held-out images on first use; None if `dataset` has them all."""
         limit = config.max_eval_images
@@ -114,5 +114,5 @@ class HeldOut:
 
     def write_curve(self, state: State) -> None:
         """Write all evaluations of a `state` to learning_curve.json, if there is a folder."""
-        if self._folder is not None:
-            write_report(self._folder / "learning_curve.json", rows(in_order(state.curve, state.looks)))
+        if self.folder is not None:
+            write_report(self.folder / "learning_curve.json", rows(in_order(state.curve, state.looks)))

@@ -11,7 +11,6 @@ from nerfloom.base.device import peak_memory
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.json_files import finite_or_null, write_json
 from nerfloom.evaluation.evaluator import Evaluation
-from nerfloom.ray_model import RayModel
 from nerfloom.training.machine import kernels, machine
 from nerfloom.training.outcome import Outcome
 from nerfloom.training.run import Run, write_report
@@ -77,8 +76,8 @@ def write_summary(path: Path, trainer: Trainer, outcome: Outcome) -> None:
             "seconds": state.seconds,
             "rays": state.rays,
             "rays_per_second": state.rays / max(state.seconds, 1e-9),
-            # Mean of the last steps, without the samples of proposals; None if the method casts no rays.
-            "samples_per_ray": state.samples_per_ray if isinstance(trainer.model, RayModel) else None,
+            # Mean of the last steps, without the samples of proposals; of an octree, leaves.
+            **({"samples_per_ray": state.samples_per_ray} if trainer.model.batches == "pixels" else {}),
             "skipped_steps": state.skipped,
             "peak_memory_bytes": peak_memory(trainer.device),
             "parameters": trainer.model.size(),

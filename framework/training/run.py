@@ -19,7 +19,7 @@ import dataclasses
 import os
 import shlex
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,8 @@ from nerfloom.training.run_path import CONFIG, config_file
 
 TRANSFORMS = "dataparser_transforms.json"
 """Name of the placement in a run's folder."""
+TIMESTAMP = "%Y-%m-%d_%H%M%S"
+"""Format of the name of a run's folder."""
 PLACEMENT_TOLERANCE = 1e-3
 """Tolerated distance between two placements of a camera, relative to the furthest camera's distance from the origin."""
 
@@ -121,8 +123,28 @@ def _moved(parsed: ParsedScene, then: Placement) -> float:
 def run_folder(method: str, config: TrainConfig) -> Path:
     """Return the folder of a new run of `method`: outputs/{experiment}/{method}/{timestamp}."""
     experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
-    timestamp = config.timestamp or datetime.now().strftime("%Y-%m-%d_%H%M%S")
+    timestamp = config.timestamp or datetime.now().strftime(TIMESTAMP)
     return config.output_dir / experiment / method / timestamp
+
+
+def with_own_folder(run: Run) -> Run:
+    """Create an empty folder for a new `run` without --timestamp, and return the run.
+
+    If the folder exists, it belongs to a run that began in the same second. The name is then of a later second.
+
+    Raises:
+        ConfigError: if the folder cannot be created.
+    """
+    while not run.config.timestamp:
+        try:
+            run.folder.mkdir(parents=True)
+            break
+        except OSError as error:
+            if not os.path.lexists(run.folder):
+                raise ConfigError(f"cannot write the run's folder {run.folder}: {error.strerror or error}") from error
+        later = datetime.strptime(run.folder.name, TIMESTAMP) + timedelta(seconds=1)
+        run = dataclasses.replace(run, folder=run.folder.with_name(later.strftime(TIMESTAMP)))
+    return run
 
 
 def create_folder(run: Run) -> None:

@@ -244,7 +244,7 @@ class Trainer:
     def prepare(self, start: bool = True) -> None:
         """Find contradicted tiles, mark empty space and initialise the model from the images, before the first step.
 
-        This counts as training time.
+        This counts as training time, but not again in a resumed run.
 
         Args:
             start: whether the model may initialise itself from the images; False if the caller sets its parameters.
@@ -255,8 +255,10 @@ class Trainer:
         self._join_first()
         begun, fresh = time.perf_counter(), self.state.step == 0
         tiles, config = self.source.contradicted, self.config
+        counts = fresh  # a resumed run has counted its preparation, but no scout that is new
         if tiles is not None and config.robust == "scout":
             if not tiles.known:
+                counts = True
                 self._by_first(partial(scout, Trainer, self.train_set, tiles, config, **budget(config)))
             self.train_set = self.train_set.drawing(tiles.counted())
         self.train_set = skip_empty(config, self.model, self.train_set, fresh)
@@ -265,10 +267,10 @@ class Trainer:
             seed_step(config.machine.seed, -1)  # independent of earlier draws
             self._by_first(partial(self.model.start, self.train_set))
         seconds = time.perf_counter() - begun + self._deciding
-        if fresh:
+        if counts:
             self.state.seconds += seconds
         if seconds >= MIN_REPORTED_SECONDS:
-            say(f"prepared in {seconds:.1f} s, which count as training")
+            say(f"prepared in {seconds:.1f} s" + (", which count as training" if counts else ""))
 
     def _by_first(self, work: Callable[[], None]) -> None:
         """Do work in the first process; the others then take over its state."""

@@ -14,7 +14,7 @@ SHARED = ("rgb", "depth", "accumulation")
 
 def is_shared(request: Request) -> bool:
     """Return whether a file can show the picture of a `request`, with arrays of the same names as the run's."""
-    return request.output in SHARED and not request.overlay and request.divider is None
+    return request.output in SHARED and not request.overlay
 
 
 def draw_in_motion(loaded: Loaded, quick: Loaded, request: Request, piece: Piece) -> Arrays:

@@ -45,7 +45,8 @@ class RenderQueue:
         ndc: function that returns the normalised device coordinates of the scene; None if it has none.
         truth: true images for the output `error` and the overlay.
         second: a second run or file, drawn beside the first; None for none.
-        quick: a faster file of the same scene, drawn while the camera moves; None for the run itself.
+        quick: a faster file of the same scene, drawn while the camera moves, not beside a second; None for the run
+            itself.
     """
 
     def __init__(

@@ -31,7 +31,8 @@ def view_loaded(
         port: port to listen on; the next free one if it is taken.
         follow: whether to show newer checkpoints of the run as they are written.
         second: a second run or file of the same data, which is shown beside the first; None for none.
-        quick: a faster file of the same scene, which is drawn while the camera moves; None for none.
+        quick: a faster file of the same scene, which is drawn while the camera moves, not beside a second; None for
+            none.
 
     Raises:
         ConfigError: if viser is missing, the address cannot be used, or the two cannot be shown side by side.

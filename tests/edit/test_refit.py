@@ -41,3 +41,9 @@ def test_what_is_left_looks_more_like_all_of_them(tmp_path: Path) -> None:
 def test_refitting_needs_photographs() -> None:
     with pytest.raises(ConfigError, match="refit_steps needs the photographs"):
         edit.reduce_to(scattered(), 10, refit_steps=5)
+
+
+def test_gaussians_that_are_all_kept_are_not_refitted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = ball_in_capture(tmp_path)
+    assert edit.reduce_to(whole, len(whole), refit_steps=5) is whole
+    assert "nothing is refitted" in capsys.readouterr().err

@@ -12,7 +12,8 @@ import pytest
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.session import start
-from nerfloom.training.checkpoint import list_checkpoints, load_newest
+from nerfloom.training.checkpoint import FOLDER, list_checkpoints, load_newest
+from nerfloom.training.report import SUMMARY
 from nerfloom.training.run import run_folder
 from tests.conftest import TICK
 from tests.training.helpers import tiny_run, tiny_trainer
@@ -72,7 +73,7 @@ def test_the_newest_checkpoint_is_that_of_the_most_steps_whatever_its_date(share
 def test_a_time_that_comes_twice_names_no_folder_twice(
     shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the clock was set back, or in autumn."""
+    """After the clock was set back, in autumn, or of two runs that begin at once."""
 
     class Stopped(datetime):
         @classmethod
@@ -80,13 +81,18 @@ def test_a_time_that_comes_twice_names_no_folder_twice(
             return cls(2026, 10, 25, 2, 30)
 
     monkeypatch.setattr("nerfloom.training.run.datetime", Stopped)
-    settings = {"output_dir": tmp_path, "max_num_iterations": 1, "max_eval_images": 0}
+    settings = {"output_dir": tmp_path, "timestamp": None, "max_num_iterations": 1, "max_eval_images": 0}
     a_run = tiny_run("instant-ngp", shared_tiny, tmp_path, **settings)
     first, second = (replace(a_run, folder=run_folder(a_run.method, a_run.config)) for _ in range(2))
     assert first.folder == second.folder
-    assert first.folder.name == "2026-10-25_023000"
-    start(first)
-    before = first.config_path.read_bytes()
+    assert start(first).folder == first.folder
+    before = {path: path.read_bytes() for path in first.folder.rglob("*") if path.is_file()}
+    other = start(second)
+    assert [path.name for path in (first.folder, other.folder)] == ["2026-10-25_023000", "2026-10-25_023001"]
+    for run in (first, other):
+        assert len(list_checkpoints(run.folder / FOLDER)) == 1
+        assert (run.folder / SUMMARY).is_file()
+    named = replace(a_run.config, timestamp=first.folder.name)
     with pytest.raises(ConfigError, match="already holds a run"):
-        start(second)
-    assert first.config_path.read_bytes() == before
+        start(replace(first, config=named))
+    assert {path: path.read_bytes() for path in before} == before

@@ -16,12 +16,14 @@ from nerfloom.cameras.view import View
 from nerfloom.evaluation.error_bound import limited_error
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.light import OctreeLight
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.files import write_octree
 from nerfloom.octrees.packing import packed
 from nerfloom.registry import load_dataparser
 from tests.cli.helpers import called
 from tests.octrees.balls import CELL, RADIUS, ball, boxes
+from tests.other_device import OTHER, other_device
 
 
 def front() -> Cameras:
@@ -49,6 +51,23 @@ def test_a_ball_from_the_front() -> None:
     finer = model.render_view(View(front(), rays_per_pixel=4, stride=2), model.background)
     assert finer.size == (20, 20)
     assert float((finer.rgb - picture.rgb[1::2, 1::2]).abs().mean()) < 0.05
+
+
+def test_training_does_not_wait_for_the_number_of_leaves_that_rays_meet(monkeypatch: pytest.MonkeyPatch) -> None:
+    octree = ball()
+    model, rays = DrawnOctree(octree, octree.scene), front().pixel_rays(torch.arange(1600), 0.1, 10.0)
+    light = model.light(rays, torch.ones(3), model.early_stop / model.largest)
+    expected = model.render(rays, torch.ones(3)).num_samples
+    assert isinstance(expected, int)
+    with other_device() as mode:
+        there = OctreeLight(*(values.to(OTHER) for values in light))
+        monkeypatch.setattr(model, "light", lambda *_: there)
+        found = model.render(rays.to(OTHER), torch.ones(3)).num_samples
+        assert not mode.waits
+        assert int(found) == expected
+        with torch.no_grad():
+            assert model.render(rays.to(OTHER), torch.ones(3)).num_samples == expected
+            assert mode.waits.total() == 2
 
 
 def test_density_is_that_of_the_leaf() -> None:

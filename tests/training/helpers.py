@@ -75,7 +75,8 @@ TINY: dict[str, dict[str, Any]] = {
 def tiny_run(kind: str, data: Path, folder: Path, **changes: Any) -> Run:
     """A run of a method on the tiny data set; `kind` may carry '+variant'."""
     method = kind.split("+")[0]
-    settings = {"data": data, "vis": "none", "seconds_per_save": 1e9, **TINY.get(kind, {}), **changes}
+    given = {"data": data, "timestamp": folder.name, "vis": "none", "seconds_per_save": 1e9}
+    settings = {**given, **TINY.get(kind, {}), **changes}
     config = dataclasses.replace(load_method(method).config, **settings)
     return Run(method, config, "blender", Blender(), folder)
 

@@ -256,6 +256,23 @@ def test_a_resumed_run_has_the_same_tiles_and_bits_and_no_second_scout(
     assert_same_bits(tensors(whole), tensors(second))
 
 
+@pytest.mark.usefixtures("even_clock")
+def test_a_scout_that_begins_in_a_resumed_run_counts_as_training(
+    shared_tiny: Path, tmp_path: Path, scouted: list[dict[str, Any]]
+) -> None:
+    """What a resumed run prepares again does not count again."""
+    first = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "first", max_num_iterations=4)
+    first.train_step()
+    first.save()
+    for robust in ("off", "scout"):
+        settings = {"robust": robust, "load_dir": first.checkpoint_folder, "max_num_iterations": 4}
+        second = tiny_trainer("instant-ngp", shared_tiny, tmp_path / robust, **settings)
+        second.restore_as_configured()
+        second.prepare()
+        assert (second.state.seconds > first.state.seconds) == (robust == "scout")
+    assert len(scouted) == 1
+
+
 @pytest.mark.medium
 def test_a_scout_is_a_part_of_the_budget_and_its_training_is_thrown_away(shared_tiny: Path, tmp_path: Path) -> None:
     trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=40, robust="scout")

@@ -25,6 +25,8 @@ from nerfloom.registry import load_method
 from nerfloom.training import trainer as trainer_file
 from nerfloom.training.checkpoint import list_checkpoints, load_checkpoint
 from nerfloom.training.datasets import first_split, load_split
+from nerfloom.training.outcome import Outcome
+from nerfloom.training.report import write_summary
 from nerfloom.training.run import create_folder
 from nerfloom.training.trainer import Trainer
 from tests.conftest import TICK
@@ -430,6 +432,17 @@ def test_rays_per_second_are_those_since_errors_were_read(
     rates = [trainer.train_step().rays_per_second for _ in range(8)]
     first, then, last = 30 / 3.0, 4 * 30 / 6.0, 4 * 30 / 3.0
     assert rates == pytest.approx([first, first, first, then, then, then, then, last])
+
+
+@pytest.mark.parametrize(("method", "casts_rays"), [("voxels", True), ("gaussian-splatting", False)])
+def test_the_summary_has_the_samples_of_a_ray_where_rays_are_cast(
+    method: str, casts_rays: bool, shared_tiny: Path, tmp_path: Path
+) -> None:
+    trainer = tiny_trainer(method, shared_tiny, tmp_path / "run", max_num_iterations=1)
+    trainer.state.samples_per_ray = 12.5
+    write_summary(tmp_path / "summary.json", trainer, Outcome("1 step done", None, None))
+    found = json.loads((tmp_path / "summary.json").read_text())
+    assert found.get("samples_per_ray", "none") == (12.5 if casts_rays else "none")
 
 
 # -- without a run ------------------------------------------------------------------------------------------------

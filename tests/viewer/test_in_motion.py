@@ -10,12 +10,14 @@ import torch
 
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
+from nerfloom.cli.viewer import main
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.octree import Octree
 from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import Pose, Request
+from tests.conftest import Refused
 from tests.octrees.balls import ball
 
 
@@ -61,3 +63,7 @@ def test_the_file_moves_and_the_run_rests(output: str) -> None:
     moving = other if output == "rgb" else octree
     np.testing.assert_allclose(firsts[0] / 255, rendered(octree, at(0.0)), atol=0.01)  # it measures the run's speed
     np.testing.assert_allclose(firsts[1] / 255, rendered(moving, at(0.2)), atol=0.01)
+
+
+def test_two_runs_side_by_side_have_no_faster_file(refused: Refused) -> None:
+    assert "leave one out" in refused(main, "one.ply", "other.ply", "--while-moving", "quick.octree", status=2)

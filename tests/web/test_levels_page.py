@@ -20,6 +20,7 @@ from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
 from nerfloom.cli.export import main
 from nerfloom.evaluation.metrics import psnr
+from nerfloom.export import run_page
 from nerfloom.export.levels_page import levels_page
 from nerfloom.export.web import BITS, DATA, gaussians_of
 from nerfloom.levels.drawn import DrawnLevels
@@ -50,27 +51,29 @@ def facts_in(page: Path) -> dict[str, Any]:
 
 
 def test_chunks_lie_beside_the_page(file: LevelsFile, tmp_path: Path) -> None:
-    """They are in the frame of the page, here the scene's; chunks of an earlier page are removed."""
+    """They are in the frame of the page, here the scene's; chunks of earlier pages are removed."""
     out = tmp_path / "out"
     (out / "scene").mkdir(parents=True)
-    (out / "scene" / "99999.spz").write_bytes(b"old")
+    for old in ("99999.spz", "0123456789abcdef.spz"):
+        (out / "scene" / old).write_bytes(b"old")
     (out / "scene" / "mine.spz").write_bytes(b"of somebody else")
     done = called("ns-export", "web", file.path, "--output-dir", out)
     assert done.returncode == 0, done.stderr
     assert "3,000 Gaussians in" in " ".join(done.stderr.split())
     model = nerfloom.load(file.path).model
     assert isinstance(model, DrawnLevels)
-    names = {f"{index}.spz" for index in range(len(file.nodes))} | {"mine.spz"}
-    assert {each.name for each in (out / "scene").iterdir()} == names
+    page = out / "scene.html"
+    text, facts = page.read_text(encoding="utf-8"), facts_in(page)
+    chunks = facts["levels"]["chunks"]
+    assert {each.name for each in (out / "scene").iterdir()} == {f"{name}.spz" for name in chunks} | {"mine.spz"}
+    assert len(set(chunks)) == len(chunks) == len(file.nodes)
     total = 0
     for index in range(len(file.nodes)):
         expected = transformed(file.read(index), *model.placement.similarity())
-        found = read_spz(out / "scene" / f"{index}.spz").gaussians
+        found = read_spz(out / "scene" / f"{chunks[index]}.spz").gaussians
         torch.testing.assert_close(found.means, expected.means, atol=2e-3, rtol=0)
         total += len(found) if index in leaves(file) else 0
     assert total == 3000
-    page = out / "scene.html"
-    text, facts = page.read_text(encoding="utf-8"), facts_in(page)
     assert "connect-src 'self'" in text
     assert DATA.search(text) is not None
     assert len(gaussians_of(text)) == facts["levels"]["counts"][-1] == int(file.nodes.counts[-1])
@@ -78,6 +81,33 @@ def test_chunks_lie_beside_the_page(file: LevelsFile, tmp_path: Path) -> None:
     assert (facts["levels"]["folder"], facts["levels"]["total"]) == ("scene", 3000)
     assert 'src="data:image/jpeg;base64,' in text
     assert (out / "scene.jpg").is_file()
+
+
+def test_an_earlier_page_keeps_its_chunks_until_the_next_one_is_there(
+    file: LevelsFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An export that ends before it has written its page leaves the earlier one whole."""
+    other = built(tmp_path / "other.levels", cloud(900, 2), 300, memory=2.0)
+    page, folder = tmp_path / "scene.html", tmp_path / "scene"
+
+    def content() -> dict[str, bytes]:
+        return {name: (folder / f"{name}.spz").read_bytes() for name in facts_in(page)["levels"]["chunks"]}
+
+    def stopped(path: Path, write: object) -> None:
+        raise KeyboardInterrupt
+
+    nerfloom.load(file.path).export("web", page)
+    before = content()
+    loaded = nerfloom.load(other.path)
+    with monkeypatch.context() as patch:
+        patch.setattr(run_page, "write_atomically", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            loaded.export("web", page)
+    assert content() == before
+    assert len(list(folder.iterdir())) > len(before)
+    loaded.export("web", page)
+    assert not content().keys() & before.keys()
+    assert {each.stem for each in folder.iterdir()} == content().keys()
 
 
 def test_what_a_page_of_levels_cannot_be(file: LevelsFile, tmp_path: Path, refused: Refused) -> None:
@@ -161,7 +191,7 @@ def test_from_disk_the_coarsest_level_is_shown_and_why(
 
 @pytest.mark.slow
 def test_chunks_of_another_export_are_not_drawn(browser: str, page: tuple[Path, DrawnLevels], tmp_path: Path) -> None:
-    """The browser keeps chunks of an earlier export, which look fresh for a long time; or the host mixes them."""
+    """The browser keeps chunks of an earlier export, which look fresh for a long time; or the host has wrong ones."""
     path, _ = page
     folder, view = path.with_suffix(""), View(some_cameras()[1:2])
     other = cloud(3000, 2, torch.Generator().manual_seed(1))
@@ -180,7 +210,7 @@ def test_chunks_of_another_export_are_not_drawn(browser: str, page: tuple[Path, 
         fewer = encoded(other[:7], BITS, OURS)
         for chunk in folder.iterdir():
             chunk.write_bytes(fewer)
-        dom = opened(browser, tmp_path, f"{address}#camera=1&sort=here", "--dump-dom")
+        dom = opened(browser, tmp_path / "without copies", f"{address}#camera=1&sort=here", "--dump-dom")
     own = model.render_rgb(view, torch.ones(3)).clamp(0, 1)
     print(f"PSNR of the second page {psnr(shot, own):.1f} dB, of the first {psnr(first, own):.1f}")
     assert psnr(shot, own) > 35

@@ -43,8 +43,7 @@ function levelsOf(first, facts, here) {
   async function load(node) {
     asked.add(node);
     try {
-      // The browser asks whether its copy is still right: an earlier export may have had a chunk of this name.
-      const response = await fetch(`${encodeURIComponent(levels.folder)}/${node}.spz`, { cache: "no-cache" });
+      const response = await fetch(`${encodeURIComponent(levels.folder)}/${levels.chunks[node]}.spz`);
       if (!response.ok) throw new Error(`status ${response.status}`);
       const raw = await gunzip(new Uint8Array(await response.arrayBuffer()), options.get("inflate") === "here");
       keep(node, gaussiansOf(raw));

@@ -17,12 +17,13 @@ from nerfloom.base.json_files import write_json
 from nerfloom.processing import aria_lens
 from nerfloom.processing.capture import Capture, PosedCamera
 from nerfloom.processing.images import PreparedImage, in_parallel, prepare_all, save
+from nerfloom.processing.metashape_lens import nearest
 from nerfloom.processing.named_images import PlacedImages, reasons
 from nerfloom.processing.output import FINISHED, ready
 from nerfloom.processing.panoramas import pixels_of, view_names
 from nerfloom.processing.pyramid import write_pyramid
 from nerfloom.processing.transforms import POINTS, Frame, Lens, content, transformed, write_points
-from nerfloom.processing.views import View, Views, cut, view_lens
+from nerfloom.processing.views import Views, cut, resampled, view_lens
 
 PANORAMA, PERSPECTIVE = "EQUIRECTANGULAR", "OPENCV"
 """Models of lenses."""
@@ -45,6 +46,7 @@ def write_capture(
     """Write the data folder of a capture, and report how many of its cameras are in it and why others are not.
 
     A data folder has one model of lens. If a capture has several, images of wide lenses are cut into perspective views.
+    Images of a lens with terms that transforms.json has no place for are resampled to those of the nearest lens.
 
     Args:
         folder: folder of the photographs.
@@ -68,7 +70,7 @@ def write_capture(
     say(f"{capture.program}: {len(posed)} of {capture.total} cameras are placed{_listed(left_out)}")
     if misfits:
         say(f"{len(misfits)} images do not fit their cameras, the first: {misfits[0]}")
-    frames = _frames(posed, _models_to_cut({entry.lens.model for entry in posed}, whole), views, output)
+    frames = _frames(posed, _models_to_cut({nearest(entry.lens).model for entry in posed}, whole), views, output)
     if capture.points is not None and capture.colors is not None:
         points = capture.points @ capture.frame[:, :3].T + capture.frame[:, 3]
         write_points(output / POINTS, points, capture.colors)
@@ -115,9 +117,9 @@ def _models_to_cut(models: set[str], whole: bool) -> set[str]:
 
 def _frames(posed: list[_Posed], models: set[str], views: Views, output: Path) -> list[Frame]:
     """Return the frames, after cutting the images of some models of lenses."""
-    kept = [entry for entry in posed if entry.lens.model not in models]
-    wide = [entry for entry in posed if entry.lens.model in models]
-    frames = [Frame(entry.image.name, entry.pose, entry.lens, source=entry.image.source) for entry in kept]
+    kept = [entry for entry in posed if nearest(entry.lens).model not in models]
+    wide = [entry for entry in posed if nearest(entry.lens).model in models]
+    frames = _straightened(kept, output)
     if not wide:
         return frames
     taken = [entry.image.name for entry in posed]
@@ -133,24 +135,47 @@ def _frames(posed: list[_Posed], models: set[str], views: Views, output: Path) -
     return [*frames, *made]
 
 
+def _straightened(entries: list[_Posed], output: Path) -> list[Frame]:
+    """Return the frames of images that stay as they are, but for those of lenses that transforms.json cannot express.
+
+    Such images are replaced by what the nearest lens would have taken.
+    """
+    bent = [entry for entry in entries if nearest(entry.lens) is not entry.lens]
+
+    def straighten(entry: _Posed) -> str | None:
+        image = pixels_of(output / "images" / entry.image.name)
+        pixels, seen = resampled(image, entry.lens, nearest(entry.lens), np.eye(3))
+        return _save_with_mask(pixels, seen, entry.image.name, output)
+
+    made = in_parallel(straighten, bent, "Straightening images", len(bent)) if bent else []
+    masks = {entry.image.name: mask for entry, mask in zip(bent, made, strict=True)}
+    if bent:
+        say(f"{len(bent)} images are resampled, because transforms.json has no place for all terms of their lens")
+    return [
+        Frame(e.image.name, e.pose, nearest(e.lens), masks.get(e.image.name), source=e.image.source) for e in entries
+    ]
+
+
 def _cut(entry: _Posed, names: list[str], views: Views, output: Path) -> list[Frame]:
     """Write the views of an image, with masks where they reach beyond it, and remove the image."""
     path = output / "images" / entry.image.name
     lens = view_lens(entry.lens, views.angle)
-    made = cut(pixels_of(path), entry.lens, views)
-    frames = [_write_view(view, names[view.number], entry, lens, output) for view in made]
+    frames = []
+    for view in cut(pixels_of(path), entry.lens, views):
+        name, pose = names[view.number], entry.pose.copy()
+        pose[:3, :3] = entry.pose[:3, :3] @ view.rotation
+        mask = _save_with_mask(view.pixels, view.seen, name, output)
+        frames.append(Frame(name, pose, lens, mask, source=entry.image.source))
     path.unlink()
     return frames
 
 
-def _write_view(view: View, name: str, entry: _Posed, lens: Lens, output: Path) -> Frame:
-    save(Image.fromarray(view.pixels), output / "images" / name)
-    pose = entry.pose.copy()
-    pose[:3, :3] = entry.pose[:3, :3] @ view.rotation
-    mask = None
-    if not view.seen.all():
-        mask = f"{name}.png"
-        target = output / "masks" / mask
-        target.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.where(view.seen, 255, 0).astype(np.uint8)).save(target)
-    return Frame(name, pose, lens, mask, source=entry.image.source)
+def _save_with_mask(pixels: np.ndarray, seen: np.ndarray, name: str, output: Path) -> str | None:
+    """Write an image, and a mask if some of its pixels were not `seen`; return the mask's name, or None."""
+    save(Image.fromarray(pixels), output / "images" / name)
+    if seen.all():
+        return None
+    target = output / "masks" / f"{name}.png"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.where(seen, 255, 0).astype(np.uint8)).save(target)
+    return f"{name}.png"

@@ -37,6 +37,8 @@ POSE = ("x", "y", "alt", "heading", "pitch", "roll", "f")
 """Columns of numbers that are needed."""
 LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 """Columns of numbers that may be missing, which are 0 then."""
+STEEP, AWAY = 10.0, 100.0
+"""Positions in degrees have at least these ratios: spread of heights, and distance from 0, over spread of x and y."""
 
 
 EXPORT = "export 'Internal/External camera parameters' from RealityCapture"
@@ -47,7 +49,7 @@ def read_capture(file: Path) -> Capture:
     """Read cameras from the CSV `file`.
 
     Raises:
-        DataError: if the file cannot be read, lacks a column, or has a number that is not one.
+        DataError: if the file cannot be read, lacks a column, has a number that is not one, or positions in degrees.
     """
     rows = _rows(file)
     start = next((i for i, (_, row) in enumerate(rows) if _column(row[0]) == "name" and len(row) > 1), None)
@@ -58,6 +60,7 @@ def read_capture(file: Path) -> Capture:
     if missing:
         raise DataError(f"{file} has no column {missing[0]!r}; {EXPORT}")
     cameras = [_camera(columns, row, f"{file}: line {line}") for line, row in rows[start + 1 :]]
+    _check_lengths(cameras, file)
     frame = near_origin(cameras) if cameras else np.eye(4)[:3]
     return Capture(PROGRAM, cameras, Counter(), z_is_up=True, frame=frame)
 
@@ -90,6 +93,25 @@ def rotation_of(heading: float, pitch: float, roll: float) -> np.ndarray:
     tilted = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
     rolled = np.array([[math.cos(c), 0, math.sin(c)], [0, 1, 0], [-math.sin(c), 0, math.cos(c)]])
     return around @ tilted @ rolled
+
+
+def _check_lengths(cameras: list[PosedCamera], file: Path) -> None:
+    """Check that x and y are not degrees of longitude and latitude, which RealityScan writes for EPSG:4326.
+
+    A degree has 111 km, so such cameras are close together, far from 0, and much farther apart in height.
+    """
+    if len(cameras) < 2:
+        return
+    places = np.stack([camera.pose[:3, 3] for camera in cameras])
+    centre = places.mean(0)
+    x, y, height = places.std(0)
+    across = float(np.hypot(x, y))
+    degrees = (np.abs(places[:, :2]) <= [180, 90]).all()
+    if degrees and height > STEEP * across and float(np.linalg.norm(centre[:2])) > AWAY * across:
+        raise DataError(
+            f"{file}: x and y seem to be degrees of longitude and latitude, not lengths; export the cameras in a "
+            "coordinate system in metres, such as local:1 or UTM"
+        )
 
 
 def _rows(file: Path) -> list[tuple[int, list[str]]]:

@@ -1,19 +1,21 @@
-"""Perspective views cut out of images of wide lenses, such as panoramas."""
+"""Images of one lens resampled to those of another: views cut out of panoramas, and lenses that are straightened."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from nerfloom.base.errors import DataError
-from nerfloom.processing import aria_lens
+from nerfloom.processing import aria_lens, metashape_lens
 from nerfloom.processing.transforms import Lens
 
-BAND = 256
-"""Number of rows of a view that are computed at once, which bounds the memory."""
+BAND = 2**19
+"""Number of pixels of a view that are computed at once, which bounds the memory."""
 MIN_SEEN = 0.25
 """Views with a smaller share of pixels inside the image are left out."""
 MIN_SIDE, MAX_SIDE = 16, 16384
@@ -24,6 +26,12 @@ _MODELS = {
     "EQUIRECTANGULAR": ("equirectangular", ()),
 }
 """Model of a lens -> projection of `lenses.LENSES`, and the names of its coefficients in their order; "" for none."""
+_PROJECTIONS: dict[str, Callable[[np.ndarray, dict[str, float]], tuple[np.ndarray, np.ndarray, np.ndarray]]] = {
+    aria_lens.MODEL: aria_lens.project,
+    metashape_lens.FRAME: partial(metashape_lens.project, fisheye=False),
+    metashape_lens.FISHEYE: partial(metashape_lens.project, fisheye=True),
+}
+"""Model that transforms.json cannot express -> its projection."""
 
 
 @dataclass(frozen=True)
@@ -86,20 +94,37 @@ def cut(image: np.ndarray, lens: Lens, views: Views) -> Iterator[View]:
 
     Args:
         image: (H, W, C) uint8.
-        lens: lens of the image, of a model in OPENCV, OPENCV_FISHEYE, EQUIRECTANGULAR and FISHEYE624.
+        lens: lens of the image, of a model in OPENCV, OPENCV_FISHEYE, EQUIRECTANGULAR, FISHEYE624 and Metashape's.
         views: directions and angle.
     """
     target = view_lens(lens, views.angle)
     for number, direction in enumerate(views.directions):
         rotation = turned(*direction)
-        side = int(target.values["w"])
-        pixels, seen = np.empty((side, side, image.shape[2]), np.uint8), np.empty((side, side), bool)
-        for start in range(0, side, BAND):
-            rows = slice(start, min(start + BAND, side))
-            columns_at, rows_at, seen[rows] = positions(lens, target, rotation, rows)
-            pixels[rows] = interpolated(image, columns_at, rows_at, wraps=lens.model == "EQUIRECTANGULAR")
+        pixels, seen = resampled(image, lens, target, rotation)
         if seen.mean() >= MIN_SEEN:
             yield View(number, rotation, pixels, seen)
+
+
+def resampled(image: np.ndarray, lens: Lens, target: Lens, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a camera of another lens and direction shows, by linear interpolation between an image's pixels.
+
+    Args:
+        image: (H, W, C) uint8.
+        lens: lens of the image.
+        target: lens of the result, of a model of transforms.json.
+        rotation: (3, 3) from the result's camera to the image's, OpenGL axes.
+
+    Returns:
+        Pixels (target's h, w, C) uint8, and (h, w) bool, whether they lie inside the image.
+    """
+    width, height = int(target.values["w"]), int(target.values["h"])
+    pixels, seen = np.empty((height, width, image.shape[2]), np.uint8), np.empty((height, width), bool)
+    step = max(BAND // width, 1)
+    for start in range(0, height, step):
+        rows = slice(start, min(start + step, height))
+        columns_at, rows_at, seen[rows] = positions(lens, target, rotation, rows)
+        pixels[rows] = interpolated(image, columns_at, rows_at, wraps=lens.model == "EQUIRECTANGULAR")
+    return pixels, seen
 
 
 def positions(lens: Lens, view: Lens, rotation: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -107,7 +132,7 @@ def positions(lens: Lens, view: Lens, rotation: np.ndarray, rows: slice) -> tupl
 
     Args:
         lens: lens of the image.
-        view: lens of the view.
+        view: lens of the view, of a model of transforms.json.
         rotation: (3, 3) from the view's camera to the image's, OpenGL axes.
         rows: R rows of the view.
 
@@ -116,35 +141,55 @@ def positions(lens: Lens, view: Lens, rotation: np.ndarray, rows: slice) -> tupl
         bool, whether the position is inside the image.
     """
     down, across = np.mgrid[rows, : int(view.values["w"])] + 0.5
-    local = np.stack(
-        [
-            (across - view.values["cx"]) / view.values["fl_x"],
-            (view.values["cy"] - down) / view.values["fl_y"],
-            -np.ones_like(across),
-        ],
-        -1,
-    )
-    x, y, visible = _projected(lens, (local @ rotation.T).reshape(-1, 3))
+    local, shown = _directions(view, across.reshape(-1), down.reshape(-1))
+    x, y, visible = _projected(lens, local @ rotation.T)
     unit = math.pi if lens.model == "EQUIRECTANGULAR" else 1.0  # the focal length of a panorama is half its width
     columns = x.reshape(across.shape) * (lens.values["fl_x"] / unit) + lens.values["cx"]
     lines = y.reshape(across.shape) * (lens.values["fl_y"] / unit) + lens.values["cy"]
     inside = (columns >= 0) & (columns <= lens.values["w"]) & (lines >= 0) & (lines <= lens.values["h"])
-    return columns, lines, inside & visible.reshape(across.shape)
+    return columns, lines, inside & (visible & shown).reshape(across.shape)
+
+
+def _directions(lens: Lens, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the directions (N, 3), OpenGL axes, of positions (N,) in an image, and (N,) bool, whether there is one."""
+    import torch
+
+    from nerfloom.geometry.lenses import unproject
+
+    model, distortion = _torch_lens(lens)
+    unit = math.pi if lens.model == "EQUIRECTANGULAR" else 1.0
+    x = torch.from_numpy((columns - lens.values["cx"]) / lens.values["fl_x"] * unit)
+    y = torch.from_numpy((rows - lens.values["cy"]) / lens.values["fl_y"] * unit)
+    rays = unproject(model, x, y, distortion)
+    return rays.directions.numpy(), rays.valid.numpy()
 
 
 def _projected(lens: Lens, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where a lens shows directions (N, 3): x and y (N,) of its image plane, y down, and whether it does."""
-    if lens.model == aria_lens.MODEL:
-        return aria_lens.project(directions, lens.values)
+    if lens.model in _PROJECTIONS:
+        return _PROJECTIONS[lens.model](directions, lens.values)
     import torch
 
-    from nerfloom.geometry.lenses import DISTORTED, Distortion, project
+    from nerfloom.geometry.lenses import project
 
-    model, names = _MODELS[lens.model]
-    coefficients = torch.tensor([[lens.values.get(name, 0.0) for name in names]], dtype=torch.float64)
-    distortion = Distortion.of(model, coefficients) if model in DISTORTED else None
+    model, distortion = _torch_lens(lens)
     x, y, visible = project(model, torch.from_numpy(directions), distortion)
     return x.numpy(), y.numpy(), visible.numpy()
+
+
+def _torch_lens(lens: Lens) -> tuple[str, Any]:
+    """Return the projection of a lens of transforms.json, a key of `lenses.LENSES`, and its `Distortion` or None."""
+    import torch
+
+    from nerfloom.geometry.lenses import DISTORTED, Distortion
+
+    model, names = _MODELS[lens.model]
+    coefficients = [lens.values.get(name, 0.0) for name in names]
+    if model == "opencv" and not any(coefficients):
+        model = "pinhole"
+    if model not in DISTORTED:
+        return model, None
+    return model, Distortion.of(model, torch.tensor([coefficients], dtype=torch.float64))
 
 
 def interpolated(image: np.ndarray, columns: np.ndarray, rows: np.ndarray, wraps: bool) -> np.ndarray:

@@ -399,13 +399,13 @@ MUTANTS = {
     "nerfloom.processing.metashape": [
         Mutant("metashape-scale-of-positions", "_pose", "A + world.scale * B", "A + B",
             "positions of a scaled chunk stay in its own unit",
-            "processing/test_programs.py::test_lenses_of_metashape"),
+            "processing/test_reprojection.py::test_points_of_a_converted_capture"),
     ],
     "nerfloom.processing.metashape_lens": [
         Mutant("metashape-tangential-exchanged", "lens_of", "{'p1': given['p2'], 'p2': given['p1']}",
             "{'p1': given['p1'], 'p2': given['p2']}",
             "tangential coefficients of Metashape are taken for OpenCV's",
-            "processing/test_programs.py::test_lenses_of_metashape"),
+            "processing/test_reprojection.py::test_points_of_a_converted_capture"),
     ],
     "nerfloom.processing.realitycapture": [
         Mutant("realitycapture-heading-turned", "rotation_of", "(-heading, pitch, roll)", "(heading, pitch, roll)",

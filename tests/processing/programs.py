@@ -20,7 +20,11 @@ FRAME = {
     "p2": -0.006,
 }  # fmt: skip
 """A calibration of Metashape."""
+BENT = {**FRAME, "b2": -3.0, "p3": 0.4, "p4": -0.3}
+"""A calibration with terms that transforms.json has no place for."""
 FISHEYE = {"f": 30.0, "cx": 0.5, "cy": 1.25, "b1": -0.4, "k1": 0.05, "k2": -0.02, "k3": 0.006, "k4": -0.001}
+BENT_FISHEYE = {**FISHEYE, "b2": 2.0, "p1": 0.008, "p2": -0.006, "p3": 0.3}
+"""The same of a fisheye."""
 ROTATION, _ = np.linalg.qr(np.random.default_rng(77).normal(size=(3, 3)))
 ROTATION *= np.linalg.det(ROTATION)
 CHUNK = (ROTATION, np.array([3.0, -2.0, 1.5]), 2.5)
@@ -117,8 +121,9 @@ def metashape_pixels(local: np.ndarray, c: dict[str, float], fisheye: bool) -> n
         x, y = x * np.arctan(r0) / r0, y * np.arctan(r0) / r0
     r2 = x * x + y * y
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
-    bent_x = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
-    bent_y = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    more = 1 + c.get("p3", 0.0) * r2 + c.get("p4", 0.0) * r2**2
+    bent_x = x * radial + (p1 * (r2 + 2 * x * x) + 2 * p2 * x * y) * more
+    bent_y = y * radial + (p2 * (r2 + 2 * y * y) + 2 * p1 * x * y) * more
     u = WIDTH * 0.5 + c["cx"] + bent_x * c["f"] + bent_x * b1 + bent_y * b2
     return np.stack([u, HEIGHT * 0.5 + c["cy"] + bent_y * c["f"]], 1)
 
@@ -267,30 +272,3 @@ def bundler_pixels(local: np.ndarray) -> np.ndarray:
 def in_world(index: int, local: np.ndarray) -> np.ndarray:
     """(K, 3) in the world of cameras with the poses `rotation_at` and `position_at`."""
     return local @ rotation_at(index).T + position_at(index)
-
-
-# -- transforms.json ------------------------------------------------------------------------------------------------
-
-
-def written_pixels(content: dict[str, Any], frame: dict[str, Any], world: np.ndarray) -> np.ndarray:
-    """(K, 2) pixels of points in the program's frame, by transforms.json (nerfstudio's data conventions)."""
-    value = {**content, **frame}
-    applied = np.array(content["applied_transform"])
-    pose = np.array(frame["transform_matrix"])
-    local = (world @ applied[:, :3].T + applied[:, 3] - pose[:3, 3]) @ pose[:3, :3]
-    right, down, ahead = local[:, 0], -local[:, 1], -local[:, 2]
-    if value["camera_model"] == "EQUIRECTANGULAR":
-        x, y = np.arctan2(right, ahead) / np.pi, np.arctan2(down, np.hypot(right, ahead)) / np.pi
-    else:
-        k1, k2, k3, k4, p1, p2 = (value.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
-        x, y = right / ahead, down / ahead
-        if value["camera_model"] == "OPENCV_FISHEYE":
-            r = np.hypot(x, y)
-            x, y = np.arctan(r) * x / r, np.arctan(r) * y / r
-        r2 = x * x + y * y
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
-        x, y = (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        )
-    return np.stack([value["fl_x"] * x + value["cx"], value["fl_y"] * y + value["cy"]], 1)

@@ -13,11 +13,9 @@ from nerfloom.base.json_files import write_json
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.ply import read_points
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.processing import features, mapping, matching, transforms
-from nerfloom.processing import reconstruction as module
-from nerfloom.processing.reconstruction import Reconstruction
+from nerfloom.processing import transforms
 from tests.cli.helpers import called
-from tests.dataparsers.sparse_models import write_colmap
+from tests.processing.known_poses import without_colmap
 from tests.processing.programs import document, numbers, sensor
 from tests.truth.ball import (
     CENTRE,
@@ -48,27 +46,6 @@ def process(kind: str, data: Path, output: Path, *flags: object) -> dict[str, An
     return content
 
 
-def without_colmap(monkeypatch: pytest.MonkeyPatch, camera: str, order: list[str]) -> None:
-    """COLMAP finds the truth at once: the poses, the lens and points of the ball.
-
-    Args:
-        order: names that the photographs have been given.
-    """
-
-    def extract(state: Reconstruction, *_: object) -> None:
-        state.database.touch()
-
-    def reconstruct(state: Reconstruction, *_: object) -> list[int]:
-        write_colmap(state.work / "sparse" / "0", model_of(order), camera)
-        return [COUNT]
-
-    monkeypatch.setattr(features, "extract", extract)
-    monkeypatch.setattr(matching, "choose_pairs", lambda *_: [])
-    monkeypatch.setattr(matching, "match", lambda *_: None)
-    monkeypatch.setattr(mapping, "reconstruct", reconstruct)
-    monkeypatch.setattr(module, "run_in_child", lambda work, arguments, *_: work(None, *arguments))
-
-
 @pytest.mark.medium
 @pytest.mark.parametrize("model", WRITABLE)
 def test_photographs_with_the_poses_and_the_lens_that_colmap_finds(
@@ -76,7 +53,7 @@ def test_photographs_with_the_poses_and_the_lens_that_colmap_finds(
 ) -> None:
     order, lens = COLMAP_CAMERAS[model]
     write_photographs(tmp_path / "photographs", NAMES, lens)
-    without_colmap(monkeypatch, camera_line(model, order, lens), NAMES)
+    without_colmap(monkeypatch, camera_line(model, order, lens), model_of())
     output = tmp_path / "out"
     content = process("images", tmp_path / "photographs", output, "--num-downscales", 1)
     assert len(content["frames"]) == COUNT
@@ -124,7 +101,7 @@ def test_a_mask_comes_with_its_photograph_and_a_reduced_one_is_white_where_all_o
     for index, name in enumerate(NAMES):
         Image.fromarray(np.roll(white, index, 1).astype(np.uint8) * 255).save(tmp_path / "masks" / name)
     order, lens = COLMAP_CAMERAS["PINHOLE"]
-    without_colmap(monkeypatch, camera_line("PINHOLE", order, lens), NAMES)
+    without_colmap(monkeypatch, camera_line("PINHOLE", order, lens), model_of())
     output = tmp_path / "out"
     process("images", tmp_path / "photographs", output, "--masks-dir", tmp_path / "masks", "--num-downscales", 1)
     for factor in (1, 2):
@@ -145,7 +122,7 @@ def test_photographs_of_a_phone_that_was_turned(tmp_path: Path, monkeypatch: pyt
         turned = np.ascontiguousarray(np.rot90(photograph(index)))
         Image.fromarray(turned).save(tmp_path / "photographs" / name, exif=exif)
     order, lens = COLMAP_CAMERAS["PINHOLE"]
-    without_colmap(monkeypatch, camera_line("PINHOLE", order, lens), NAMES)
+    without_colmap(monkeypatch, camera_line("PINHOLE", order, lens), model_of())
     process("images", tmp_path / "photographs", tmp_path / "out", "--num-downscales", 0)
     assert_pixels_show_the_ball(EVERY.parse(tmp_path / "out", "train"), None)
 

@@ -117,16 +117,15 @@ def test_files_are_read_back(kind: str, tmp_path: Path) -> None:
     normals = vertex_normals(mesh)
     colors = torch.rand(len(mesh.vertices), 3)
     write_mesh(tmp_path / f"ball.{kind}", Mesh(mesh.vertices, mesh.faces, normals, colors))
-    read = trimesh.load(tmp_path / f"ball.{kind}", process=False, force="mesh")
+    options = {"skip_materials": True} if kind == "glb" else {}  # beside a material, trimesh loses colours of vertices
+    read = trimesh.load(tmp_path / f"ball.{kind}", process=False, force="mesh", **options)
     assert read.is_watertight
     assert read.volume == pytest.approx(4 / 3 * math.pi * 0.125, rel=0.02)
     np.testing.assert_allclose(np.sort(read.vertices, 0), np.sort(mesh.vertices.numpy(), 0), atol=1e-6)
+    shown = colors.numpy()
     if kind == "glb":  # linear light, by the transfer function of sRGB
-        light = read.visual.vertex_attributes["color"]
-        shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-        np.testing.assert_allclose(shown, colors.numpy(), atol=1e-6)
-    else:
-        np.testing.assert_allclose(read.visual.vertex_colors[:, :3], 255 * colors.numpy(), atol=1.01)
+        shown = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(read.visual.vertex_colors[:, :3], 255 * shown, atol=1.01)
     np.testing.assert_allclose(read.vertex_normals, normals.numpy(), atol=0.01)  # PLY's and OBJ's are computed anew
     assert {"ply": b"property float nx", "obj": b"\nvn ", "glb": b'"NORMAL"'}[kind] in (
         tmp_path / f"ball.{kind}"

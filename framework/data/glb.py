@@ -61,7 +61,7 @@ def glb_bytes(
         accessors.append(_accessor(len(arrays), indices.reshape(-1, 1)))
         arrays.append(indices)
         uses.append({"target": INDICES})
-    images = {}
+    images: dict[str, Any] = {}
     if image is not None:
         images = {"images": [{"bufferView": len(arrays), "mimeType": "image/png"}]}
         arrays.append(np.frombuffer(image, np.uint8))

@@ -197,7 +197,15 @@ def test_others_read_our_files(tmp_path: Path, degree: int) -> None:
         write_gaussians(file, given, look=look, spz_version=version)
     spz = [("read-spz", ours[f"a{version}.spz"], tmp_path / f"{version}.json") for version in (2, 3, 4)]
     js, glb = tmp_path / "js.json", tmp_path / "glb.json"
-    run(*sum(spz, ()), "read-spz-js", ours["a2.spz"], js, "read-splat-glb", ours["a.glb"], glb)
+    run(
+        *[word for words in spz for word in words],
+        "read-spz-js",
+        ours["a2.spz"],
+        js,
+        "read-splat-glb",
+        ours["a.glb"],
+        glb,
+    )
     told("PLY: splat-transform", differences(in_table(convert(ours["a.ply"], tmp_path / "a.csv")), given), exact)
     told("glTF: PlayCanvas's engine", differences(in_cloud(glb)[0], given), exact)
     for version in (2, 3, 4):

@@ -1,4 +1,4 @@
-"""Mesh files: PLY, and OBJ and GLB, which trimesh writes."""
+"""Mesh files: PLY, GLB, and OBJ, which trimesh writes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 from torch import Tensor
@@ -16,6 +16,7 @@ from nerfloom.base.console import say
 from nerfloom.data.offsets import write_offset
 from nerfloom.data.ply import coordinate_columns, in_full, write_columns
 from nerfloom.export.mesh import Mesh
+from nerfloom.export.mesh_glb import encoded_mesh
 from nerfloom.export.texture import Texture
 from nerfloom.geometry.local_origin import local_origin
 
@@ -39,6 +40,7 @@ def write_mesh(file: Path, mesh: Mesh) -> None:
         mesh: a mesh on the CPU. With a texture it has no vertex colours in the file, and PLY files have no texture.
 
     Raises:
+        ConfigError: if a GLB file would be larger than 4 GiB.
         OSError: if the file cannot be written.
     """
     if file.suffix == ".ply":
@@ -47,13 +49,16 @@ def write_mesh(file: Path, mesh: Mesh) -> None:
     origin = local_origin(mesh.vertices)
     if origin is not None and file.suffix == ".glb":
         mesh = replace(mesh, vertices=mesh.vertices - origin)
+    if file.suffix == ".glb":
+        write_atomically(file, partial(_put, encoded_mesh(mesh)))
+        if sentence := write_offset(file, origin):
+            say(sentence)
+        return
     if mesh.texture is None:
         _write_colored(file, mesh)
     else:
         _write_textured(file, mesh, mesh.texture)
-    if file.suffix == ".glb" and (sentence := write_offset(file, origin)):
-        say(sentence)
-    elif origin is not None:
+    if origin is not None:
         say(f"{file.name}: {in_full(mesh.vertices)}")
 
 
@@ -91,10 +96,8 @@ def _write_colored(file: Path, mesh: Mesh) -> None:
         process=False,
         validate=False,
     )
-    flags: dict[str, Any] = {"include_normals": mesh.normals is not None}
-    if file.suffix == ".obj":
-        flags["digits"] = decimals(mesh.vertices)
-    write_atomically(file, lambda stream: made.export(stream, file_type=file.suffix[1:], **flags))
+    flags = {"include_normals": mesh.normals is not None, "digits": decimals(mesh.vertices)}
+    write_atomically(file, lambda stream: made.export(stream, file_type="obj", **flags))
 
 
 def _write_textured(file: Path, mesh: Mesh, texture: Texture) -> None:
@@ -114,13 +117,9 @@ def _write_textured(file: Path, mesh: Mesh, texture: Texture) -> None:
         process=False,
         validate=False,
     )
-    normals = mesh.normals is not None
-    if file.suffix == ".glb":
-        write_atomically(file, lambda stream: made.export(stream, file_type="glb", include_normals=normals))
-        return
     text, beside = trimesh.exchange.obj.export_obj(
         made,
-        include_normals=normals,
+        include_normals=mesh.normals is not None,
         return_texture=True,
         write_texture=False,
         mtl_name=f"{file.stem}.mtl",

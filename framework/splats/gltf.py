@@ -20,29 +20,21 @@ In glTF, y is up. The Gaussians must be given so (`Placement.y_up`).
 
 from __future__ import annotations
 
-import json
-import struct
-from typing import Any
-
 import numpy as np
 from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.data.glb import glb_bytes
+from nerfloom.kernels.color import to_linear
 from nerfloom.kernels.splats.project import BLUR, DC
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look, comments
 
 EXTENSION = "KHR_gaussian_splatting"
-MAX_BYTES = 2**32 - 1
-"""Maximum size of a GLB file: the header states it in 32 bits."""
 MAX_LOG_SCALE = 88.0
 """Maximum logarithm of a standard deviation: its exponential is finite in float32."""
-FLOAT, UNSIGNED_SHORT = 5126, 5123
-"""Numbers of the types in glTF."""
-ARRAY_BUFFER, POINTS = 34962, 0
-"""Numbers of the use of a buffer, and of the kind of primitive, in glTF."""
-TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-"""Names of shapes, by the number of values."""
+POINTS = 0
+"""Number of the kind of primitive in glTF."""
 
 
 def encoded_glb(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[str]]:
@@ -59,18 +51,6 @@ def encoded_glb(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
     """
     if not len(gaussians):
         raise ConfigError("a glTF file holds at least one Gaussian, and there is none")
-    attributes = _attributes(gaussians)
-    views, accessors, offset = list[dict[str, Any]](), list[dict[str, Any]](), 0
-    for index, values in enumerate(attributes.values()):
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": ARRAY_BUFFER})
-        accessor = {"bufferView": index, "count": len(values), "type": TYPES[values.shape[1]]}
-        if values.dtype == np.float32:
-            accessors.append({**accessor, "componentType": FLOAT})
-        else:
-            accessors.append({**accessor, "componentType": UNSIGNED_SHORT, "normalized": True})
-        offset += values.nbytes  # a multiple of 4
-    ends = attributes["POSITION"].min(0), attributes["POSITION"].max(0)
-    accessors[0] |= {"min": ends[0].tolist(), "max": ends[1].tolist()}
     splatting = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
@@ -78,23 +58,9 @@ def encoded_glb(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
         "sortingMethod": "cameraDistance",
         "extras": {"comments": comments(look)},
     }
-    primitive = {
-        "attributes": {name: index for index, name in enumerate(attributes)},
-        "mode": POINTS,
-        "extensions": {EXTENSION: splatting},
-    }
-    content = {
-        "asset": {"version": "2.0", "generator": "Nerfloom"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "Gaussians"}],
-        "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": offset}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    return _glb(content, list(attributes.values())), _unsaid(look)
+    primitive = {"mode": POINTS, "extensions": {EXTENSION: splatting}}
+    content = {"extensionsUsed": [EXTENSION]}
+    return glb_bytes("Gaussians", _attributes(gaussians), primitive, content), _unsaid(look)
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -102,9 +68,7 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     rotations = gaussians.rotations.double()
     rotations = rotations / rotations.norm(dim=-1, keepdim=True).clamp(min=1e-300)
     opacity = gaussians.logits.double().sigmoid()[:, None].numpy()
-    display = (0.5 + DC * gaussians.colors.double().numpy()).clip(0, 1)
-    # The transfer function of sRGB (IEC 61966-2-1).
-    linear = np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+    linear = to_linear((0.5 + DC * gaussians.colors.double()).clamp(0, 1)).numpy()
     found = {
         "POSITION": _float(gaussians.means),
         f"{EXTENSION}:ROTATION": _float(rotations[:, [1, 2, 3, 0]]),
@@ -134,16 +98,3 @@ def _unsaid(look: Look) -> list[str]:
     if look.sort != "distance":
         words.append("that they were sorted by depth, not by distance")
     return [f"glTF cannot say {' or '.join(words)}: other programs draw them otherwise"] if words else []
-
-
-def _glb(content: dict[str, Any], arrays: list[np.ndarray]) -> bytes:
-    """Return a GLB file (glTF 2.0, section 4.4): header, JSON and binary chunk, each a multiple of four bytes."""
-    text = json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    size = sum(array.nbytes for array in arrays)
-    total = 12 + 8 + len(text) + 8 + size
-    if total > MAX_BYTES:
-        raise ConfigError(f"a glTF file holds 4 GiB, and the Gaussians need {total / 2**30:.1f}: write a PLY file")
-    parts = [struct.pack("<4sII", b"glTF", 2, total), struct.pack("<I4s", len(text), b"JSON"), text]
-    parts += [struct.pack("<I4s", size, b"BIN\0"), *(array.tobytes() for array in arrays)]
-    return b"".join(parts)

@@ -238,6 +238,14 @@ MUTANTS = {
             "walls that leave the box are dropped, and hollows are kept",
             "export/test_mesh.py::test_hollows_are_dropped_unless_a_camera_is_inside"),
     ],
+    "nerfloom.export.mesh_glb": [
+        Mutant("mesh-glb-display", "encoded_mesh", "to_linear(A)", "A",
+            "other programs show the colours of a GLB file too bright",
+            "export/test_mesh.py::test_files_are_read_back"),
+        Mutant("mesh-glb-upside-down", "encoded_mesh", "1 - places[:, 1]", "places[:, 1]",
+            "the texture of a GLB file is upside down",
+            "export/test_texture.py::test_a_file_has_the_colours_of_the_surface"),
+    ],
     "nerfloom.export.points": [
         Mutant("points-of-mean-depth", "surface_points", "depth[:, None]", "out.depth.float()[:, None]",
             "points of edges lie between what is in front and what is behind",

@@ -19,7 +19,7 @@ from tests.splats.test_files import UTM, Splats, directions, exported, matrices,
 
 NAME = "KHR_gaussian_splatting"
 KINDS = {5126: "<f4", 5123: "<u2"}
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 
 def read(file: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -32,8 +32,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.processing.aria_lens import MODEL, NAMES
 from nerfloom.processing.capture import Capture, PosedCamera, camera_pose
 from nerfloom.processing.finite_numbers import UNUSABLE, bounded, finite_array
-from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import evenly_spaced
+from nerfloom.processing.listing import evenly_spaced, find_images
 from nerfloom.processing.point_files import GREY, MAX_POINTS
 from nerfloom.processing.record3d import rotations
 from nerfloom.processing.transforms import Lens

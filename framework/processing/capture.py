@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from nerfloom.base.errors import DataError
+from nerfloom.processing.finite_numbers import finite, side
 from nerfloom.processing.transforms import Lens
 
 ASPECT_TOLERANCE = 0.01
@@ -81,6 +83,19 @@ def camera_pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
     return pose
 
 
+def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
+    """Return a lens without distortion, of width and height `size` and fx, fy, cx, cy `intrinsics`, pixels.
+
+    Raises:
+        TypeError, ValueError, OverflowError: if a value is invalid (`UNUSABLE`).
+    """
+    width, height = (side(value) for value in size)
+    fx, fy, cx, cy = (finite(value) for value in intrinsics)
+    if min(fx, fy) <= 0:
+        raise ValueError("a focal length must be above zero")
+    return Lens("OPENCV", {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
+
+
 def for_size_of(lens: Lens) -> LensOf:
     """Return the function of an image's size that gives the lens `lens` for it."""
     return partial(resized, lens)
@@ -101,6 +116,14 @@ def resized(lens: Lens, width: int, height: int) -> Lens:
     factors = {"fl_x": across, "cx": across, "fl_y": down, "cy": down}
     values = {key: value * factors.get(key, 1) for key, value in lens.values.items()}
     return Lens(lens.model, values | {"w": width, "h": height})
+
+
+def cropped(lens: Lens, crop: int) -> Lens:
+    """Return the `lens` of images with `crop` pixels cut off at each side."""
+    values = dict(lens.values)
+    for key, change in (("w", 2 * crop), ("h", 2 * crop), ("cx", crop), ("cy", crop)):
+        values[key] -= change
+    return Lens(lens.model, values)
 
 
 def spread_of(cameras: list[PosedCamera]) -> tuple[np.ndarray, float]:

@@ -362,7 +362,7 @@ MUTANTS = {
             "a panorama passes for a capture",
             "processing/test_parallax.py::test_a_rotation_explains_a_panorama_and_no_walk"),
     ],
-    "nerfloom.processing.phone": [
+    "nerfloom.processing.capture": [
         Mutant("crop-moves-nothing", "cropped", "(('w', A), ('h', A), ('cx', crop), ('cy', crop))",
             "(('w', A), ('h', A), ('cx', 0), ('cy', 0))",
             "cropped images of ns-process-data polycam have a principal point that is off by the border",
@@ -378,8 +378,8 @@ MUTANTS = {
             "truth/test_processing.py::test_photographs_with_the_poses_and_the_lens_that_colmap_finds"),
     ],
     "nerfloom.processing.polycam": [
-        Mutant("applied-transform-identity", "convert", "Z_UP", "np.eye(4)[:3]",
-            "exports of a Polycam capture come out in another frame than Polycam's",
+        Mutant("polycam-y-stays-up", "read_capture", "Z_UP", "np.eye(4)[:3]",
+            "a Polycam capture lies on its side, and nothing estimates its up direction",
             "truth/test_processing.py::test_polycam"),
     ],
     "nerfloom.processing.pyramid": [

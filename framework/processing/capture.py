@@ -75,14 +75,6 @@ def relative_name(name: str) -> str:
     return "/".join(parts[1:] if len(parts) > 1 and parts[0].endswith(":") else parts)
 
 
-def camera_pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return camera-to-world (4, 4), OpenGL axes, from `rotation` (3, 3), y down, z ahead, and `position` (3,)."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation * [1, -1, -1]
-    pose[:3, 3] = position
-    return pose
-
-
 def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
     """Return a lens without distortion, of width and height `size` and fx, fy, cx, cy `intrinsics`, pixels.
 
@@ -137,14 +129,13 @@ def near_origin(cameras: list[PosedCamera]) -> np.ndarray:
     """Return the transform (3, 4) of `Capture.frame` that moves cameras near the origin if they are far from it.
 
     Coordinates of maps have millions of metres, and files of points eight digits. The origin becomes the cameras' mean
-    position, in whole units.
-
-    Args:
-        cameras: at least one.
+    position, in whole units. Fewer than two cameras stay where they are.
     """
     frame = np.eye(4)[:3]
+    if len(cameras) < 2:
+        return frame
     centre, spread = spread_of(cameras)
-    if np.linalg.norm(centre) > FAR * max(spread, 1e-9) and len(cameras) > 1:
+    if np.linalg.norm(centre) > FAR * max(spread, 1e-9):
         frame[:, 3] = -np.round(centre)
     return frame
 

@@ -425,7 +425,7 @@ MUTANTS = {
         Mutant("written-fisheye-loses-k4", "lens_of", "('k1', 'k2', 'k3', 'k4')", "('k1', 'k2', 'k3')",
             "ns-process-data drops the last coefficient of a fisheye lens",
             "truth/test_lenses.py::test_colmaps_cameras_as_they_are_written_and_read"),
-        Mutant("opengl-axes-written", "opengl_pose", "A * [1, -1, -1]", "A",
+        Mutant("opengl-axes-written", "camera_pose", "A * [1, -1, -1]", "A",
             "cameras of ns-process-data look backwards",
             "processing/test_transforms_written.py::test_points_are_seen_where_colmap_sees_them"),
         Mutant("mask-of-other-name-written", "content", "'masks/'", "'images/'",

@@ -19,13 +19,12 @@ from nerfloom.processing.settings import (
     MetashapeFlags,
     OdmFlags,
     OutputFlags,
-    PhoneFlags,
     PolycamFlags,
     ProgramFlags,
     RealityCaptureFlags,
     Record3DFlags,
+    RecordingFlags,
     VideoFlags,
-    most_images,
 )
 
 if TYPE_CHECKING:
@@ -170,7 +169,7 @@ def _convert_record3d(flags: Record3DFlags) -> None:
 
 
 @contextmanager
-def _export(flags: PhoneFlags, place: Place, find: Callable[[Path], object], needs: str) -> Iterator[Path]:
+def _export(flags: RecordingFlags, place: Place, find: Callable[[Path], object], needs: str) -> Iterator[Path]:
     """Claim the output folder, and yield the folder of an app's export, unpacked within a `with` block.
 
     Args:
@@ -222,7 +221,7 @@ def _convert_aria(flags: AriaFlags) -> None:
     from nerfloom.processing.aria import read_capture
     from nerfloom.processing.named_images import images_as_named
 
-    capture = read_capture(flags.data, flags.mps_data_dir, most_images(flags.max_dataset_size))
+    capture = read_capture(flags.data, flags.mps_data_dir, flags.most)
     _convert(flags, flags.data, capture, images_as_named(capture))
 
 

@@ -23,7 +23,7 @@ MUTANTS = {
         Mutant("depth-along-ray", "ray_distances", "A / cosines.clamp(min=0.001)", "A",
             "depth along the axis is taken for distance along the ray, short at the edges of pictures",
             "test_depths.py::test_a_wall_straight_ahead_is_further_along_slanted_rays"),
-        Mutant("depth-rows-columns", "read_depth", "A + 0.5", "A",
+        Mutant("depth-rows-columns", "nearest_pixels", "A + 0.5", "A",
             "depth images of another size are shifted by half a pixel of theirs",
             "truth/test_captures.py::test_a_depth_image_of_another_size_gives_what_is_at_the_pixels_middle"),
     ],

@@ -67,7 +67,7 @@ def check_pixels(what: str, shape: Sequence[int], width: int, height: int) -> No
 
 
 def nearest_pixels(shape: Sequence[int], width: int, height: int) -> tuple[np.ndarray, ...]:
-    """Return the rows (H, 1) and columns (1, W) of an image of `shape` that are nearest to `width` x `height` pixels."""
+    """Return the rows (H, 1) and columns (1, W) of an image of `shape` nearest to the pixels of `width` x `height`."""
     rows, columns = (
         np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)
         for count, size in zip((height, width), shape[:2], strict=True)

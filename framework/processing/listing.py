@@ -8,10 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
 T = TypeVar("T")
@@ -47,7 +46,7 @@ def evenly_spaced(items: list[T], most: int) -> list[T]:
     if len(items) <= most:
         return items
     say(f"{most} of {len(items)} images are taken, evenly spaced (--max-dataset-size)")
-    return [items[i] for i in np.linspace(0, len(items) - 1, most).round().astype(int).tolist()]
+    return [items[index] for index in evenly_spread(len(items), most)]
 
 
 def kind_of(kind: str, data: Path) -> tuple[str, Path]:

@@ -132,9 +132,7 @@ def _local_directions(
 
 
 @torch.no_grad()
-def draw_colors(
-    gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor, rasteriser: Rasteriser = RASTERISER
-) -> Tensor:
+def draw_colors(gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor) -> Tensor:
     """Draw the colours (H, W, 3) of a picture alone, which takes less time than `draw_view`.
 
     Args:
@@ -143,7 +141,7 @@ def draw_colors(
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
     """
-    return every(rasteriser.draw(rasteriser.project(gaussians, camera), camera, background).image, stride)
+    return every(RASTERISER.draw(RASTERISER.project(gaussians, camera), camera, background).image, stride)
 
 
 @torch.no_grad()

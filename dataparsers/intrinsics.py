@@ -13,8 +13,9 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.errors import nearest, shown
+from nerfloom.base.json_files import number
 from nerfloom.dataparsers.captured import sizes_of
-from nerfloom.dataparsers.reading import Frames, number, numbers, side_or_none
+from nerfloom.dataparsers.reading import Frames, numbers, side_or_none
 
 PERSPECTIVE = ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4"))
 """Projection, and the file's names of its coefficients in the order of `LENSES`."""

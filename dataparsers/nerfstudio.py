@@ -14,7 +14,7 @@ from nerfloom import DataError, ParsedScene
 from nerfloom.base.console import say
 from nerfloom.base.errors import shown
 from nerfloom.base.evenly_spaced import evenly_spaced
-from nerfloom.base.json_files import read_object
+from nerfloom.base.json_files import number, read_object
 from nerfloom.base.splits import Split
 from nerfloom.cameras.poses import Orientation
 from nerfloom.data.depths import DEPTH_SUFFIXES
@@ -29,7 +29,7 @@ from nerfloom.dataparsers.companions import companions
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.placing import from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
-from nerfloom.dataparsers.reading import Frames, file_name, number, read_frames, read_pose, read_times, rigid
+from nerfloom.dataparsers.reading import Frames, file_name, read_frames, read_pose, read_times, rigid
 
 TRANSFORMS = "transforms.json"
 """File that identifies the format."""

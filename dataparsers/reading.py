@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.errors import shown
+from nerfloom.base.json_files import number
 from nerfloom.cameras.cameras import MAX_SIDE, check_pose
 from nerfloom.dataparsers.rotations import nearest_rotation
 
@@ -84,29 +84,6 @@ def read_times(frames: Frames) -> Tensor | None:
         if not isinstance(time, (int, float)) or isinstance(time, bool) or not 0 <= time <= 1:
             raise DataError(f"{label}: 'time' is {shown(time)}; it must be a number from 0 to 1")
     return torch.tensor([float(frame["time"]) for frame, _ in frames])
-
-
-def number(value: Any, name: str, where: str, positive: bool = False) -> float:
-    """Return a finite number.
-
-    Args:
-        value: the entry's value; None if it is missing.
-        name: name of the entry in the message.
-        where: name of the file and frame in the message.
-        positive: whether the number must be positive.
-
-    Raises:
-        DataError: if the value is not such a number.
-    """
-    expected = "a number above zero" if positive else "a number"
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    try:
-        result = float(value) if is_number else math.nan
-    except OverflowError:
-        result = math.inf
-    if not math.isfinite(result) or (positive and result <= 0):
-        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be {expected}")
-    return result
 
 
 def side(value: Any, name: str, where: str) -> int:

@@ -52,7 +52,6 @@ def captured_scene(
     Args:
         flags: the format's flags.
         images: images of all splits.
-        split: the split to return.
         division: selects the split's images; by default, every `eval_interval`-th image is held out.
         applied: the transform already applied to the poses, if the caller undoes it by `from_original`.
 

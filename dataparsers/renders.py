@@ -41,7 +41,6 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
 
     Args:
         folder: folder of the file.
-        split: the split to read.
         is_wanted: False if the images only determine the placement of others; problems are then not reported.
 
     Raises:

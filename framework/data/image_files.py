@@ -55,9 +55,6 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
 class Content(io.BytesIO):
     """The whole content of an image file. With an open file, Pillow would allocate the bytes that a chunk claims.
 
-    Args:
-        path: the file.
-
     Raises:
         OSError: if the file cannot be read.
         DataError: if it is too large to be an image.

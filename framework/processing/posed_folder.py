@@ -57,7 +57,6 @@ def write_capture(
 
     Args:
         folder: folder of the photographs.
-        capture: the capture.
         placed: the image files of its cameras.
         output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.

@@ -77,7 +77,6 @@ def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OUR
     Args:
         gaussians: N finite Gaussians on the CPU.
         bits: number of bits of harmonics of degree 1 and of higher degrees, at most 8. Fewer compress better.
-        look: the settings of drawing.
         version: version of the format.
 
     Raises:

@@ -129,7 +129,7 @@ def near_origin(cameras: list[PosedCamera]) -> np.ndarray:
     """Return the transform (3, 4) of `Capture.frame` that moves cameras near the origin if they are far from it.
 
     Coordinates of maps have millions of metres, and files of points eight digits. The origin becomes the cameras' mean
-    position, in whole units. Fewer than two cameras stay where they are.
+    position, in whole units. Fewer than two `cameras` stay where they are.
     """
     frame = np.eye(4)[:3]
     if len(cameras) < 2:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,11 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError
+from nerfloom.base.console import say
 from nerfloom.base.errors import nearest, shown
 from nerfloom.base.json_files import number
 from nerfloom.dataparsers.captured import sizes_of
+from nerfloom.dataparsers.posed_images import Lenses
 from nerfloom.dataparsers.reading import Frames, numbers, side_or_none
 
 PERSPECTIVE = ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4"))
@@ -39,24 +40,10 @@ NGP_OFFSET = [0.5, 0.5, 0.5]
 """instant-ngp maps a position x of the file to `scale * x + offset` in its unit cube; these are its defaults."""
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """Intrinsics of M frames, and a contradiction in the file, if any."""
-
-    values: Tensor
-    """(M, 4) float64 fx, fy, cx, cy in pixels of an image of `sizes`."""
-    sizes: Tensor
-    """(M, 2) int64 width and height that the values refer to, which may differ from the image files."""
-    model: str
-    """Projection, a key of `LENSES`."""
-    lens: Tensor | None
-    """(M, K) distortion coefficients in the order of `LENSES[model]`; None if the projection has none."""
-    warning: str | None
-    """Message about focal lengths that contradict an angle in the file; None if there is none."""
-
-
-def read_intrinsics(file: Path, content: dict[str, Any], frames: Frames, unstated: Callable[[], Tensor]) -> Intrinsics:
-    """Return the intrinsics stated in a transforms file.
+def read_intrinsics(
+    file: Path, content: dict[str, Any], frames: Frames, unstated: Callable[[], Tensor], quiet: bool
+) -> Lenses:
+    """Return the intrinsics stated in a transforms file, and report a focal length that contradicts an angle in it.
 
     A frame's own values take precedence over values for all frames, and a focal length over an angle of view. The
     principal point defaults to the image's centre. The focal length along one axis defaults to that along the other.
@@ -66,6 +53,7 @@ def read_intrinsics(file: Path, content: dict[str, Any], frames: Frames, unstate
         content: the file's JSON object.
         frames: M frames.
         unstated: returns width and height (M, 2) int64 of the images; called if the file does not state all of them.
+        quiet: whether to report nothing.
 
     Raises:
         DataError: if a value is invalid, or there is no focal length.
@@ -77,13 +65,10 @@ def read_intrinsics(file: Path, content: dict[str, Any], frames: Frames, unstate
     values = [_values(*pair, content, size, model) for pair, size in zip(frames, sizes.tolist(), strict=True)]
     lens = [[_number(frame, content, key, label) or 0.0 for key in keys] for frame, label in frames]
     warnings = (_contradiction(*pair, content, size) for pair, size in zip(frames, sizes.tolist(), strict=True))
-    return Intrinsics(
-        values=torch.tensor(values, dtype=torch.float64),
-        sizes=sizes,
-        model=model,
-        lens=torch.tensor(lens) if keys else None,
-        warning=None if model == "equirectangular" else next(filter(None, warnings), None),
-    )
+    warning = None if model == "equirectangular" else next(filter(None, warnings), None)
+    if warning and not quiet:
+        say(warning)
+    return Lenses(torch.tensor(values, dtype=torch.float64), sizes, model, torch.tensor(lens) if keys else None)
 
 
 def ngp_cube(content: dict[str, Any], file: Path) -> tuple[Tensor, float] | None:

@@ -104,19 +104,17 @@ def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedIma
     frames = read_frames(content, file, "file_path")
     written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in frames]
     paths = on_disk(file.parent, written, quiet=split != "train")
-    intrinsics = read_intrinsics(file, content, frames, lambda: image_sizes(paths))
-    if intrinsics.warning and split == "train":  # reported once
-        say(intrinsics.warning)
+    lenses = read_intrinsics(file, content, frames, lambda: image_sizes(paths), quiet=split != "train")
     poses = torch.stack([read_pose(frame, label) for frame, label in frames])
     return PosedImages(
         folder=file.parent,
         paths=paths,
         names=tuple(str(PurePosixPath(name)) for name in written),
         poses=poses,
-        intrinsics=intrinsics.values,
-        sizes=intrinsics.sizes,
-        model=intrinsics.model,
-        lens=intrinsics.lens,
+        intrinsics=lenses.intrinsics,
+        sizes=lenses.sizes,
+        model=lenses.model,
+        lens=lenses.lens,
         masks=companions(file.parent, frames, "mask_path", IMAGE_SUFFIXES, split),
         depths=companions(file.parent, frames, "depth_file_path", DEPTH_SUFFIXES, split),
         times=read_times(frames),

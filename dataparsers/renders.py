@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom.base.console import say
 from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.dataset import existing_files
@@ -50,23 +49,22 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
     content = read_object(file)
     frames = read_frames(content, file, "file_path")
     names = [file_name(frame.get("file_path"), "file_path", label) for frame, label in frames]  # often without suffixes
-    paths = on_disk(folder, names, quiet=split != "train" or not is_wanted)
+    quiet = split != "train" or not is_wanted
+    paths = on_disk(folder, names, quiet=quiet)
     poses = torch.stack([read_pose(frame, label) for frame, label in frames])
     keep = existing_files(paths, split) if is_wanted else _existing(paths)
     size = image_size([paths[index] for index in keep.tolist()])
     frames, plain = [(_without_sensor(frame), label) for frame, label in frames], _without_sensor(content)
-    intrinsics = read_intrinsics(file, plain, frames, lambda: torch.tensor([size]).expand(len(paths), 2))
-    if intrinsics.warning and is_wanted and split == "train":  # reported once
-        say(intrinsics.warning)
+    lenses = read_intrinsics(file, plain, frames, lambda: torch.tensor([size]).expand(len(paths), 2), quiet)
     images = PosedImages(
         folder=folder,
         paths=paths,
         names=tuple(path.name for path in paths),
         poses=poses,
-        intrinsics=intrinsics.values,
-        sizes=intrinsics.sizes,
-        model=intrinsics.model,
-        lens=intrinsics.lens,
+        intrinsics=lenses.intrinsics,
+        sizes=lenses.sizes,
+        model=lenses.model,
+        lens=lenses.lens,
         times=read_times(frames),
     )
     sources = content, *(frame for frame, _ in frames)

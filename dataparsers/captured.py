@@ -18,7 +18,7 @@ from nerfloom.cameras.poses import Placement, estimate_near, held_out
 from nerfloom.data.dataset import existing_files
 from nerfloom.data.exposure import read_taken
 from nerfloom.data.image_files import image_size
-from nerfloom.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk
+from nerfloom.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk, reduced_folder
 from nerfloom.dataparsers.placing import Applied, placement_of
 from nerfloom.dataparsers.posed_images import Captured, PosedImages, StatedRegion
 from nerfloom.dataparsers.region import distances
@@ -52,7 +52,6 @@ def captured_scene(
     Args:
         flags: the format's flags.
         images: images of all splits.
-        split: the split to return.
         division: selects the split's images; by default, every `eval_interval`-th image is held out.
         applied: the transform already applied to the poses, if the caller undoes it by `from_original`.
 
@@ -196,7 +195,7 @@ def _reduced(path: Path, root: Path | None, step: int) -> Path:
         return path
     if root is None:
         return path / "none"
-    folder = root.with_name(f"{root.name}_{step}")
+    folder = reduced_folder(root, step)
     file = folder / path.relative_to(root)
     alternatives = [file.with_suffix(ending) for ending in LIKELIEST if folder.is_dir()]
     return next((alternative for alternative in (file, *alternatives) if alternative.is_file()), file)

@@ -3,29 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.cameras.colmap import PARAMETERS, Intrinsics, from_colmap
 from nerfloom.dataparsers.colmap_model import SparseCamera
+from nerfloom.dataparsers.posed_images import Lenses
 from nerfloom.geometry.lenses import LENSES
-
-
-@dataclass(frozen=True)
-class Lenses:
-    """Intrinsics of M images."""
-
-    intrinsics: Tensor
-    """(M, 4) float64 fx, fy, cx, cy in pixels of an image of `sizes`."""
-    sizes: Tensor
-    """(M, 2) int64 width and height."""
-    model: str
-    """Projection, a key of `LENSES`."""
-    lens: Tensor
-    """(M, K) distortion coefficients."""
 
 
 def lenses_of(cameras: Sequence[SparseCamera], names: Sequence[str], where: str) -> Lenses:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,12 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError
+from nerfloom.base.console import say
 from nerfloom.base.errors import nearest, shown
+from nerfloom.base.json_files import number
 from nerfloom.dataparsers.captured import sizes_of
-from nerfloom.dataparsers.reading import number, numbers, side_or_none
+from nerfloom.dataparsers.posed_images import Lenses
+from nerfloom.dataparsers.reading import Frames, numbers, side_or_none
 
 PERSPECTIVE = ("opencv", ("k1", "k2", "p1", "p2", "k3", "", "", "", "k4"))
 """Projection, and the file's names of its coefficients in the order of `LENSES`."""
@@ -38,26 +40,10 @@ NGP_OFFSET = [0.5, 0.5, 0.5]
 """instant-ngp maps a position x of the file to `scale * x + offset` in its unit cube; these are its defaults."""
 
 
-@dataclass(frozen=True)
-class Intrinsics:
-    """Intrinsics of M frames, and a contradiction in the file, if any."""
-
-    values: Tensor
-    """(M, 4) float64 fx, fy, cx, cy in pixels of an image of `sizes`."""
-    sizes: Tensor
-    """(M, 2) int64 width and height that the values refer to, which may differ from the image files."""
-    model: str
-    """Projection, a key of `LENSES`."""
-    lens: Tensor | None
-    """(M, K) distortion coefficients in the order of `LENSES[model]`; None if the projection has none."""
-    warning: str | None
-    """Message about focal lengths that contradict an angle in the file; None if there is none."""
-
-
 def read_intrinsics(
-    file: Path, content: dict[str, Any], frames: list[dict[str, Any]], labels: list[str], unstated: Callable[[], Tensor]
-) -> Intrinsics:
-    """Return the intrinsics stated in a transforms file.
+    file: Path, content: dict[str, Any], frames: Frames, unstated: Callable[[], Tensor], quiet: bool
+) -> Lenses:
+    """Return the intrinsics stated in a transforms file, and report a focal length that contradicts an angle in it.
 
     A frame's own values take precedence over values for all frames, and a focal length over an angle of view. The
     principal point defaults to the image's centre. The focal length along one axis defaults to that along the other.
@@ -65,28 +51,24 @@ def read_intrinsics(
     Args:
         file: the file, for messages.
         content: the file's JSON object.
-        frames: the JSON objects of M frames.
-        labels: M names of the frames in messages.
+        frames: M frames.
         unstated: returns width and height (M, 2) int64 of the images; called if the file does not state all of them.
+        quiet: whether to report nothing.
 
     Raises:
         DataError: if a value is invalid, or there is no focal length.
     """
-    placed = list(zip(frames, labels, strict=True))
     sizes = sizes_of(
-        [[side_or_none(_value(frame, content, key), key, label) for key in "wh"] for frame, label in placed], unstated
+        [[side_or_none(_value(frame, content, key), key, label) for key in "wh"] for frame, label in frames], unstated
     )
     model, keys = _camera_model(file, content, frames)
-    values = [_values(*pair, content, size, model) for pair, size in zip(placed, sizes.tolist(), strict=True)]
-    lens = [[_number(frame, content, key, label) or 0.0 for key in keys] for frame, label in placed]
-    warnings = (_contradiction(*pair, content, size) for pair, size in zip(placed, sizes.tolist(), strict=True))
-    return Intrinsics(
-        values=torch.tensor(values, dtype=torch.float64),
-        sizes=sizes,
-        model=model,
-        lens=torch.tensor(lens) if keys else None,
-        warning=None if model == "equirectangular" else next(filter(None, warnings), None),
-    )
+    values = [_values(*pair, content, size, model) for pair, size in zip(frames, sizes.tolist(), strict=True)]
+    lens = [[_number(frame, content, key, label) or 0.0 for key in keys] for frame, label in frames]
+    warnings = (_contradiction(*pair, content, size) for pair, size in zip(frames, sizes.tolist(), strict=True))
+    warning = None if model == "equirectangular" else next(filter(None, warnings), None)
+    if warning and not quiet:
+        say(warning)
+    return Lenses(torch.tensor(values, dtype=torch.float64), sizes, model, torch.tensor(lens) if keys else None)
 
 
 def ngp_cube(content: dict[str, Any], file: Path) -> tuple[Tensor, float] | None:
@@ -114,11 +96,11 @@ def _number(frame: dict[str, Any], content: dict[str, Any], key: str, label: str
     return None if value is None else number(value, key, label)
 
 
-def _camera_model(file: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[str, tuple[str, ...]]:
+def _camera_model(file: Path, content: dict[str, Any], frames: Frames) -> tuple[str, tuple[str, ...]]:
     """Return the projection of all frames, and the names of its coefficients in the file."""
     if content.get("is_fisheye") is True:  # instant-ngp's key
         return FISHEYE
-    given = [_value(frame, content, "camera_model") or "PERSPECTIVE" for frame in frames]
+    given = [_value(frame, content, "camera_model") or "PERSPECTIVE" for frame, _ in frames]
     named = {name if isinstance(name, str) else shown(name) for name in given}
     for name in sorted(named - set(CAMERA_MODELS)):
         raise DataError(f"{file}: unknown camera_model '{shown(name)[1:-1]}'. {nearest(name, CAMERA_MODELS)}")

@@ -15,11 +15,11 @@ from nerfloom.base.errors import one_line
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import check_pose
 from nerfloom.cameras.ndc import NdcCameras, find_ndc, ndc_box
-from nerfloom.data.names_on_disk import REDUCED
-from nerfloom.data.suffixes import IMAGE_SUFFIXES
+from nerfloom.data.names_on_disk import REDUCED, reduced_folder
 from nerfloom.dataparsers.captured import captured_scene, checked_box, has_transforms
 from nerfloom.dataparsers.colmap_model import find_models
 from nerfloom.dataparsers.masks import find_masks
+from nerfloom.dataparsers.numbered import image_names
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
 
 POSES = "poses_bounds.npy"
@@ -177,10 +177,9 @@ def _image_names(root: Path) -> list[str]:
     Raises:
         DataError: if there are no images.
     """
-    folders = [root if step == 1 else root.with_name(f"{root.name}_{step}") for step in REDUCED]
+    folders = [reduced_folder(root, factor) for factor in REDUCED]
     for folder in folders:
-        names = sorted(file.name for file in folder.glob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
-        if names:
+        if names := image_names(folder):
             return names
     listed = ", ".join(folder.name for folder in folders)
     raise DataError(

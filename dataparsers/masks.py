@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nerfloom.base.console import say
-from nerfloom.data.names_on_disk import REDUCED, files_below, spelled, without_ending
+from nerfloom.data.names_on_disk import REDUCED, files_below, reduced_folder, spelled, without_ending
 
 
 def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | None:
@@ -21,8 +21,7 @@ def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | No
     Returns:
         Files in `root`, even if only reduced ones exist; None for an image without mask.
     """
-    folders = [root if step == 1 else root.with_name(f"{root.name}_{step}") for step in REDUCED]
-    available = sorted({file for folder in folders for file in files_below(folder)})
+    available = sorted({file for factor in REDUCED for file in files_below(reduced_folder(root, factor))})
     found = {key: file for file in available for key in (without_ending(file), spelled(file))}
     masks = []
     for name in names:

@@ -14,7 +14,7 @@ from nerfloom import DataError, ParsedScene
 from nerfloom.base.console import say
 from nerfloom.base.errors import shown
 from nerfloom.base.evenly_spaced import evenly_spaced
-from nerfloom.base.json_files import read_object
+from nerfloom.base.json_files import number, read_object
 from nerfloom.base.splits import Split
 from nerfloom.cameras.poses import Orientation
 from nerfloom.data.depths import DEPTH_SUFFIXES
@@ -29,7 +29,7 @@ from nerfloom.dataparsers.companions import companions
 from nerfloom.dataparsers.intrinsics import ngp_cube, read_intrinsics
 from nerfloom.dataparsers.placing import from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
-from nerfloom.dataparsers.reading import file_name, number, read_frames, read_pose, read_times, rigid
+from nerfloom.dataparsers.reading import Frames, file_name, read_frames, read_pose, read_times, rigid
 
 TRANSFORMS = "transforms.json"
 """File that identifies the format."""
@@ -101,39 +101,36 @@ class Nerfstudio(Captured):
 
 
 def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedImages:
-    frames, labels = read_frames(content, file, "file_path")
-    placed = list(zip(frames, labels, strict=True))
-    written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]
+    frames = read_frames(content, file, "file_path")
+    written = [file_name(frame.get("file_path"), "file_path", label) for frame, label in frames]
     paths = on_disk(file.parent, written, quiet=split != "train")
-    intrinsics = read_intrinsics(file, content, frames, labels, lambda: image_sizes(paths))
-    if intrinsics.warning and split == "train":  # reported once
-        say(intrinsics.warning)
-    poses = torch.stack([read_pose(frame, label) for frame, label in placed])
+    lenses = read_intrinsics(file, content, frames, lambda: image_sizes(paths), quiet=split != "train")
+    poses = torch.stack([read_pose(frame, label) for frame, label in frames])
     return PosedImages(
         folder=file.parent,
         paths=paths,
         names=tuple(str(PurePosixPath(name)) for name in written),
         poses=poses,
-        intrinsics=intrinsics.values,
-        sizes=intrinsics.sizes,
-        model=intrinsics.model,
-        lens=intrinsics.lens,
-        masks=companions(file.parent, frames, "mask_path", labels, IMAGE_SUFFIXES, split),
-        depths=companions(file.parent, frames, "depth_file_path", labels, DEPTH_SUFFIXES, split),
-        times=read_times(frames, labels),
+        intrinsics=lenses.intrinsics,
+        sizes=lenses.sizes,
+        model=lenses.model,
+        lens=lenses.lens,
+        masks=companions(file.parent, frames, "mask_path", IMAGE_SUFFIXES, split),
+        depths=companions(file.parent, frames, "depth_file_path", DEPTH_SUFFIXES, split),
+        times=read_times(frames),
         points=_points(file, content, split),
-        tracks=_tracks(file, content, placed, poses),
-        taken=_taken(content, placed),
+        tracks=_tracks(file, content, frames, poses),
+        taken=_taken(content, frames),
     )
 
 
-def _taken(content: dict[str, Any], placed: list[tuple[dict[str, Any], str]]) -> tuple[Taken, ...] | None:
+def _taken(content: dict[str, Any], frames: Frames) -> tuple[Taken, ...] | None:
     """Return the exposures that frames state, or the file for all of them; None if no frame has all of `EXPOSURE`."""
-    stated = [{key: frame.get(key, content.get(key)) for key in EXPOSURE} for frame, _ in placed]
+    stated = [{key: frame.get(key, content.get(key)) for key in EXPOSURE} for frame, _ in frames]
     if not any(None not in values.values() for values in stated):
         return None
     taken = []
-    for values, (_, label) in zip(stated, placed, strict=True):
+    for values, (_, label) in zip(stated, frames, strict=True):
         if None in values.values():
             taken.append(Taken())
             continue
@@ -158,13 +155,11 @@ def _points(file: Path, content: dict[str, Any], split: Split) -> Tensor | None:
     return read_points(path)
 
 
-def _tracks(
-    file: Path, content: dict[str, Any], placed: list[tuple[dict[str, Any], str]], poses: Tensor
-) -> Tracks | None:
+def _tracks(file: Path, content: dict[str, Any], frames: Frames, poses: Tensor) -> Tracks | None:
     """Return which images see which points, from the COLMAP model beside the file, in the frame of the poses."""
     names = [
         names_in_model(file_name(frame["file_path"], "file_path", label), frame.get("source_path"))
-        for frame, label in placed
+        for frame, label in frames
     ]
     return tracks_beside(file.parent, names, poses, *_applied(content, file))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from nerfloom import DataError, ParsedScene
-from nerfloom.base.json_files import read_object
+from nerfloom.base.json_files import number, read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.depths import DEPTH_SUFFIXES
 from nerfloom.data.names_on_disk import on_disk
@@ -16,7 +16,7 @@ from nerfloom.data.scene import PoseSource
 from nerfloom.dataparsers.captured import captured_scene, has_transforms, image_sizes, sizes_of
 from nerfloom.dataparsers.placing import from_original
 from nerfloom.dataparsers.posed_images import Captured, PosedImages
-from nerfloom.dataparsers.reading import number, rigid, side_or_none
+from nerfloom.dataparsers.reading import rigid, side_or_none
 
 CAMERAS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and images in `keyframes`; those refined by Polycam come first."""

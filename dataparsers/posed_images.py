@@ -62,6 +62,20 @@ class StatedRegion:
 
 
 @dataclass(frozen=True)
+class Lenses:
+    """Intrinsics of M images."""
+
+    intrinsics: Tensor
+    """(M, 4) float64 fx, fy, cx, cy in pixels of an image of `sizes`."""
+    sizes: Tensor
+    """(M, 2) int64 width and height that the intrinsics refer to, which may differ from the size of the image files."""
+    model: str
+    """Projection, a key of `LENSES`."""
+    lens: Tensor | None
+    """(M, K) distortion coefficients in the order of `LENSES[model]`; None if the projection has none."""
+
+
+@dataclass(frozen=True)
 class PosedImages:
     """M images of all splits as a format's files describe them, before any image file is read."""
 

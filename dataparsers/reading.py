@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.errors import shown
+from nerfloom.base.json_files import number
 from nerfloom.cameras.cameras import MAX_SIDE, check_pose
 from nerfloom.dataparsers.rotations import nearest_rotation
 
@@ -21,8 +21,12 @@ MAX_PATH_LENGTH = 3000
 """Maximum length of a path, bytes; most systems allow 4096."""
 
 
-def read_frames(content: dict[str, Any], file: Path, image: str) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the frames that `content` of `file` lists, named by the entry `image`, and their names in messages.
+Frames = list[tuple[dict[str, Any], str]]
+"""The JSON object of each frame, and its name in messages."""
+
+
+def read_frames(content: dict[str, Any], file: Path, image: str) -> Frames:
+    """Return the frames that `content` of `file` lists; each names its image by the entry `image`.
 
     Raises:
         DataError: if no frames are listed, or one is not an object.
@@ -30,11 +34,11 @@ def read_frames(content: dict[str, Any], file: Path, image: str) -> tuple[list[d
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{file} lists no frames; 'frames' must be a list of images and their poses")
-    labels = [f"{file}: frame {index}" for index in range(len(frames))]
-    for frame, label in zip(frames, labels, strict=True):
+    named = [(frame, f"{file}: frame {index}") for index, frame in enumerate(frames)]
+    for frame, label in named:
         if not isinstance(frame, dict):
             raise DataError(f"{label} is {shown(frame)}; it must be an object with '{image}'")
-    return frames, labels
+    return named
 
 
 def read_pose(frame: dict[str, Any], where: str) -> Tensor:
@@ -67,42 +71,19 @@ def rigid(matrix: Any, name: str, where: str) -> Tensor:
     return pose if pose.shape[0] == 4 else torch.cat([pose, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
 
-def read_times(frames: list[Any], where: list[str]) -> Tensor | None:
-    """Return the times (M,) in [0, 1] of JSON objects `frames`, `where` in messages; None if no frame has one.
+def read_times(frames: Frames) -> Tensor | None:
+    """Return the times (M,) in [0, 1] of `frames`; None if no frame has one.
 
     Raises:
         DataError: if only some frames have a time, or one is not a number from 0 to 1.
     """
-    if not any("time" in frame for frame in frames):
+    if not any("time" in frame for frame, _ in frames):
         return None
-    for frame, label in zip(frames, where, strict=True):
+    for frame, label in frames:
         time = frame.get("time")
         if not isinstance(time, (int, float)) or isinstance(time, bool) or not 0 <= time <= 1:
             raise DataError(f"{label}: 'time' is {shown(time)}; it must be a number from 0 to 1")
-    return torch.tensor([float(frame["time"]) for frame in frames])
-
-
-def number(value: Any, name: str, where: str, positive: bool = False) -> float:
-    """Return a finite number.
-
-    Args:
-        value: the entry's value; None if it is missing.
-        name: name of the entry in the message.
-        where: name of the file and frame in the message.
-        positive: whether the number must be positive.
-
-    Raises:
-        DataError: if the value is not such a number.
-    """
-    expected = "a number above zero" if positive else "a number"
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    try:
-        result = float(value) if is_number else math.nan
-    except OverflowError:
-        result = math.inf
-    if not math.isfinite(result) or (positive and result <= 0):
-        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be {expected}")
-    return result
+    return torch.tensor([float(frame["time"]) for frame, _ in frames])
 
 
 def side(value: Any, name: str, where: str) -> int:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfloom import DataError, ParsedScene
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.dataset import existing_files
@@ -49,7 +50,8 @@ class Record3D(Captured):
         content = read_object(file)
         poses = _poses(content, file)
         paths = on_disk(folder, [f"rgb/{index}" for index in range(len(poses))], quiet=split != "train")
-        keep = _evenly_spaced(existing_files(paths, split), self.max_images)
+        existing = existing_files(paths, split)
+        keep = existing[evenly_spread(len(existing), self.max_images or len(existing))]
         width, height = (side(content.get(key), key, str(file)) for key in "wh")
         images = PosedImages(
             folder=folder,
@@ -65,13 +67,6 @@ class Record3D(Captured):
 def _folder(path: Path) -> Path:
     """Return the folder of the export: the user's folder, or a folder in it."""
     return path / EXPORT if (path / EXPORT).is_dir() else path
-
-
-def _evenly_spaced(indices: Tensor, limit: int) -> Tensor:
-    """Return at most `most` of some indices, evenly spaced, with the first and the last; all if `most` is 0."""
-    if limit == 0 or len(indices) <= limit:
-        return indices
-    return indices[torch.linspace(0, len(indices) - 1, limit, dtype=torch.float64).round().long()]
 
 
 def _poses(content: dict[str, Any], file: Path) -> Tensor:

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom.base.console import say
 from nerfloom.base.json_files import read_object
 from nerfloom.base.splits import Split
 from nerfloom.data.dataset import existing_files
@@ -41,7 +40,6 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
 
     Args:
         folder: folder of the file.
-        split: the split to read.
         is_wanted: False if the images only determine the placement of others; problems are then not reported.
 
     Raises:
@@ -49,29 +47,28 @@ def read_renders(folder: Path, split: Split, is_wanted: bool = True) -> Renders:
     """
     file = folder / f"transforms_{split}.json"
     content = read_object(file)
-    frames, labels = read_frames(content, file, "file_path")
-    placed = list(zip(frames, labels, strict=True))
-    names = [file_name(frame.get("file_path"), "file_path", label) for frame, label in placed]  # often without suffixes
-    paths = on_disk(folder, names, quiet=split != "train" or not is_wanted)
-    poses = torch.stack([read_pose(frame, label) for frame, label in placed])
+    frames = read_frames(content, file, "file_path")
+    names = [file_name(frame.get("file_path"), "file_path", label) for frame, label in frames]  # often without suffixes
+    quiet = split != "train" or not is_wanted
+    paths = on_disk(folder, names, quiet=quiet)
+    poses = torch.stack([read_pose(frame, label) for frame, label in frames])
     keep = existing_files(paths, split) if is_wanted else _existing(paths)
     size = image_size([paths[index] for index in keep.tolist()])
-    frames, plain = [_without_sensor(frame) for frame in frames], _without_sensor(content)
-    intrinsics = read_intrinsics(file, plain, frames, labels, lambda: torch.tensor([size]).expand(len(paths), 2))
-    if intrinsics.warning and is_wanted and split == "train":  # reported once
-        say(intrinsics.warning)
+    frames, plain = [(_without_sensor(frame), label) for frame, label in frames], _without_sensor(content)
+    lenses = read_intrinsics(file, plain, frames, lambda: torch.tensor([size]).expand(len(paths), 2), quiet)
     images = PosedImages(
         folder=folder,
         paths=paths,
         names=tuple(path.name for path in paths),
         poses=poses,
-        intrinsics=intrinsics.values,
-        sizes=intrinsics.sizes,
-        model=intrinsics.model,
-        lens=intrinsics.lens,
-        times=read_times(frames, labels),
+        intrinsics=lenses.intrinsics,
+        sizes=lenses.sizes,
+        model=lenses.model,
+        lens=lenses.lens,
+        times=read_times(frames),
     )
-    only_angle = not any(source.get(name) is not None for source in (content, *frames) for name in OF_LENSES)
+    sources = content, *(frame for frame, _ in frames)
+    only_angle = not any(source.get(name) is not None for source in sources for name in OF_LENSES)
     return Renders(images[keep], ngp_cube(content, file), only_angle)
 
 

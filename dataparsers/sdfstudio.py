@@ -59,29 +59,28 @@ class SdfStudio(Captured):
 
 
 def _posed_images(file: Path, content: dict[str, Any], split: Split) -> PosedImages:
-    frames, labels = read_frames(content, file, "rgb_path")
+    frames = read_frames(content, file, "rgb_path")
     if content.get("camera_model", "OPENCV") not in ("OPENCV", "PINHOLE"):
         raise DataError(f"{file}: 'camera_model' is {shown(content['camera_model'])}; it must be OPENCV")
-    placed = list(zip(frames, labels, strict=True))
-    names = [file_name(frame.get("rgb_path"), "rgb_path", label) for frame, label in placed]
+    names = [file_name(frame.get("rgb_path"), "rgb_path", label) for frame, label in frames]
     paths = on_disk(file.parent, names, quiet=split != "train")
     stated = [side_or_none(content.get(key), key, str(file)) for key in ("width", "height")]
     sizes = sizes_of([stated] * len(frames), lambda: image_sizes(paths))
-    matrices = torch.tensor([_intrinsics(*pair) for pair in placed], dtype=torch.float64)
+    matrices = torch.tensor([_intrinsics(*pair) for pair in frames], dtype=torch.float64)
     (fx, skews, cx), (fy, cy) = matrices[:, 0].unbind(-1), matrices[:, 1, 1:].unbind(-1)
     intrinsics = torch.stack([fx, fy, cx, cy], -1)
-    check_skew(skews, intrinsics, sizes, labels, quiet=split != "train")
-    key = next((key for key in MASKS if any(frame.get(key) is not None for frame in frames)), MASKS[0])
+    check_skew(skews, intrinsics, sizes, [label for _, label in frames], quiet=split != "train")
+    key = next((key for key in MASKS if any(frame.get(key) is not None for frame, _ in frames)), MASKS[0])
     axes = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))  # from OpenGL's to OpenCV's
     return PosedImages(
         folder=file.parent,
         paths=paths,
         names=tuple(str(PurePosixPath(name)) for name in names),
-        poses=torch.stack([rigid(f.get("camtoworld"), f"{where}: 'camtoworld'", where) @ axes for f, where in placed]),
+        poses=torch.stack([rigid(f.get("camtoworld"), f"{where}: 'camtoworld'", where) @ axes for f, where in frames]),
         intrinsics=intrinsics,
         sizes=sizes,
-        masks=companions(file.parent, frames, key, labels, IMAGE_SUFFIXES, split),
-        depths=companions(file.parent, frames, DEPTHS, labels, DEPTH_SUFFIXES, split),
+        masks=companions(file.parent, frames, key, IMAGE_SUFFIXES, split),
+        depths=companions(file.parent, frames, DEPTHS, DEPTH_SUFFIXES, split),
         region=_region(content, file),
     )
 

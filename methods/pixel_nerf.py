@@ -33,9 +33,9 @@ from nerfloom import (
     View,
 )
 from nerfloom.base.config import Range, SourceViewsConfig
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.data.pixels.batch import composite
 from nerfloom.data.source_views import images_of, nearest_in_direction, other_images
-from nerfloom.data.training_images import evenly_spread
 from nerfloom.encodings.pixel_aligned import ImageEncoder, SourceViews
 from nerfloom.fields.pixel_aligned import PixelAlignedField
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES

@@ -207,7 +207,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "half a turn": (one_frame(fov=180), "must be from 0.01 to 179"),
     "an angle of text": (one_frame(fov="50"), "'fov' is '50'"),
     "a shape of nothing": (one_frame(aspect=0), "'aspect' is 0"),
-    "no time": (viewers_file(seconds=0), "'seconds' is 0; it must be a number above 0"),
+    "no time": (viewers_file(seconds=0), "'seconds' is 0; it must be a number above zero"),
     "endless": (viewers_file(seconds=1e9), "3 frames in 1e+09 seconds"),
     "infinite": (viewers_file(seconds=math.inf), "'seconds' is inf"),
     "some times": (

@@ -83,7 +83,7 @@ def test_images_of_different_sizes_share_one_buffer() -> None:
 @pytest.mark.medium
 def test_pixels_of_few_images_are_drawn_evenly(dataset: Dataset) -> None:
     """Each image as often as any other, and each of its pixels: of all pixels, and of some that are to be drawn."""
-    some = PixelSet.of_pixels(torch.cat([torch.arange(5, 300), torch.arange(1203, 1210)]))  # of images 0 and 3 only
+    some = PixelSet.of_runs(torch.tensor([5, 1203]), torch.tensor([295, 7]))  # of images 0 and 3 only
     for data, images in ((dataset, 10), (replace(dataset, drawn=some), 2), (replace(dataset, drawn=some.listed()), 2)):
         torch.manual_seed(0)
         drawn = [draw_from_images(data, 100, 2) for _ in range(1000)]
@@ -151,7 +151,7 @@ def test_a_whole_image_is_composited_pixel_by_pixel(
 
 
 def test_only_pixels_worth_drawing_are_drawn(dataset: Dataset) -> None:
-    few = replace(dataset, drawn=PixelSet.of_pixels(torch.tensor([5, 401, 402])))
+    few = replace(dataset, drawn=PixelSet.of_runs(torch.tensor([5, 401]), torch.tensor([1, 2])))
     batch = draw_batch(few, 300, "white")
     assert batch.rays.camera_indices is not None
     assert set(batch.rays.camera_indices.tolist()) == {0, 1}

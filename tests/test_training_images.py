@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.data.training_images import chosen_images, evenly_spread
+from nerfloom.base.evenly_spaced import evenly_spread
+from nerfloom.data.training_images import chosen_images
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.training.datasets import load_split
 from tests.dataparsers.captures import write_capture

@@ -14,7 +14,7 @@ from pathlib import Path
 from torch import Tensor
 
 from nerfloom import DataError, DataParser, ParsedScene
-from nerfloom.base.console import say, track
+from nerfloom.base.console import say
 from nerfloom.base.splits import Split
 from nerfloom.base.user_cache import cache_folder
 from nerfloom.dataparsers.blender import Blender
@@ -145,9 +145,7 @@ class Procedural(DataParser):
             from nerfloom.dataparsers.procedural.random_scenes import write_scenes  # imported only to render
 
             views = self.views_per_scene
-            write_scenes(
-                folder, size=self.size, num_scenes=self.num_scenes, views=views, seed=self.scene_seed, progress=track
-            )
+            write_scenes(folder, size=self.size, num_scenes=self.num_scenes, views=views, seed=self.scene_seed)
             return
         counts = {"train": self.num_train, "val": 8, "test": 16}
         if self.street:
@@ -162,7 +160,6 @@ class Procedural(DataParser):
                 cars=self.cars,
                 changing=Changing(*self._changing),
                 seed=self.scene_seed,
-                progress=track,
             )
             return
         if self.courtyard:
@@ -175,12 +172,11 @@ class Procedural(DataParser):
                 distractors=self.distractors,
                 changing=Changing(*self._changing),
                 seed=self.scene_seed,
-                progress=track,
             )
             return
         from nerfloom.dataparsers.procedural.views import write_dataset
 
-        write_dataset(folder, size=self.size, counts=counts, moving=self.moving, seed=self.scene_seed, progress=track)
+        write_dataset(folder, size=self.size, counts=counts, moving=self.moving, seed=self.scene_seed)
 
 
 def _of_many(parsed: ParsedScene, split: Split) -> ParsedScene:

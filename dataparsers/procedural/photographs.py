@@ -7,12 +7,9 @@ Validation and test images are clean and in daylight. The truth about each train
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -24,12 +21,12 @@ from nerfloom.dataparsers.procedural.scene import DAYLIGHT, Light, Parts, sun_at
 from nerfloom.dataparsers.procedural.views import (
     CAMERA_ANGLE,
     complete_folder,
+    in_parallel,
     lay_out,
     render_view,
     visible_parts,
     write_views,
 )
-from nerfloom.kernels.native import torch_on_one_thread
 
 SHOWN, TOUCHED = 255, 128
 """Values of the truth: for pixels with a distractor at their centre, and for others that a distractor changes, by its
@@ -79,7 +76,6 @@ def write_photographs(
     distractors: float = 0.0,
     changing: Changing = Changing(),
     seed: int = 0,
-    progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
 ) -> None:
     """Write a data set in NeRF-Synthetic's format, completely or not at all; its files are as from `write_views`.
 
@@ -90,7 +86,6 @@ def write_photographs(
         distractors: mean share of the training images' pixels that show a distractor, at most 0.4.
         changing: the properties that differ between training images.
         seed: seed of cameras, distractors and light. The same seed gives the same bytes.
-        progress: wrapper of the iteration over training images, called with the iterable, a title and their number.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -106,11 +101,8 @@ def write_photographs(
                 places, crowds(training, distractors, seed), lights(len(training), changing, seed), strict=True
             )
         ]
-        with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
-            done = pool.map(lambda job: _write_photograph(*job, size=size), jobs)
-            for _ in progress(done, "Photographing the courtyard", len(jobs)):
-                pass
-        write_views(temporary, poses, COURTYARD, size)
+        in_parallel(partial(_write_photograph, size=size), jobs, "Photographing the courtyard")
+        write_views(temporary, poses, COURTYARD, size, "Rendering the courtyard")
 
 
 def _write_photograph(path: Path, pose: npt.NDArray[np.float64], people: Parts, lit: Light, *, size: int) -> None:

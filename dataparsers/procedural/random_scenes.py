@@ -9,8 +9,6 @@ from __future__ import annotations
 import colorsys
 import json
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ from torch import Tensor
 
 from nerfloom.dataparsers.procedural.scene import Colour, Part, Parts
 from nerfloom.dataparsers.procedural.shapes import Box, Shape, Sphere
-from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, complete_folder, render_view
+from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, complete_folder, in_parallel, render_view
 
 UNSEEN = {"val": 4, "test": 8}
 """Number of held-out scenes of each split."""
@@ -85,7 +83,6 @@ def write_scenes(
     num_scenes: int,
     views: int,
     seed: int = 0,
-    progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
 ) -> None:
     """Write a data set of many scenes in NeRF-Synthetic's format, completely or not at all.
 
@@ -95,7 +92,6 @@ def write_scenes(
         num_scenes: number of training scenes.
         views: number of views of each scene.
         seed: seed of the scenes and the cameras. The same seed gives the same bytes.
-        progress: wrapper of the iteration over scenes, called with the iterable, a title and the number of scenes.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -104,11 +100,10 @@ def write_scenes(
         jobs = [
             (temporary / split, scene) for split in ("train", *UNSEEN) for scene in scene_numbers(split, num_scenes)
         ]
-        with ThreadPoolExecutor() as pool:
-            done = pool.map(lambda job: _write_scene(job[0], job[1], size, views, seed), jobs)
-            frames: dict[str, list[dict[str, Any]]] = {}
-            for (place, _), written in zip(jobs, progress(done, "Rendering many scenes", len(jobs)), strict=True):
-                frames.setdefault(place.name, []).extend(written)
+        written = in_parallel(partial(_write_scene, size=size, views=views, seed=seed), jobs, "Rendering many scenes")
+        frames: dict[str, list[dict[str, Any]]] = {}
+        for (place, _), of_scene in zip(jobs, written, strict=True):
+            frames.setdefault(place.name, []).extend(of_scene)
         for split, of_split in frames.items():
             content = {"camera_angle_x": CAMERA_ANGLE, "frames": of_split}
             (temporary / f"transforms_{split}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")

@@ -10,13 +10,11 @@ with other lamps.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import imageio.v3 as iio
 import numpy as np
@@ -24,16 +22,15 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from nerfloom.base.console import say, track
+from nerfloom.base.console import say
 from nerfloom.base.errors import FlagError
 from nerfloom.cli.common import run_command
 from nerfloom.dataparsers.procedural.environment import Environment, make_environment
 from nerfloom.dataparsers.procedural.scene import Colour, Part, checks, trace_rows
 from nerfloom.dataparsers.procedural.shapes import Box, Shape, Sphere, Torus, dot
 from nerfloom.dataparsers.procedural.solids import SolidsFlags, flags_of, poses_around
-from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, complete_folder, lay_out
+from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, complete_folder, in_parallel, lay_out
 from nerfloom.kernels.color import to_srgb
-from nerfloom.kernels.native import torch_on_one_thread
 
 SUPERSAMPLE = 3
 """Rays along each side of a pixel."""
@@ -189,7 +186,6 @@ def write_shiny(
     num_train: int = 100,
     num_test: int = 20,
     environment: int = 0,
-    progress: Callable[[Any, int], Any] = lambda jobs, total: jobs,
 ) -> None:
     """Write the scenes, each with 8 images for validation, completely or not at all.
 
@@ -199,7 +195,6 @@ def write_shiny(
         num_train: number of training images of a scene.
         num_test: number of test images of a scene.
         environment: seed of the lamps.
-        progress: wrapper of the iteration over views, called with the iterable and the number of views.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -213,9 +208,7 @@ def write_shiny(
             for split, turn in turns.items()
             for path, pose, _ in lay_out(temporary / name, split, poses_around(*turn), moving=False)
         ]
-        with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
-            for _ in progress(pool.map(lambda job: _write_view(*job), jobs), len(jobs)):
-                pass
+        in_parallel(_write_view, jobs, "Rendering the shiny scenes")
 
 
 @dataclass(frozen=True)
@@ -230,8 +223,7 @@ def _command(arguments: list[str]) -> None:
     flags = flags_of(ShinyFlags, "shiny", arguments)
     if flags.environment < 0:
         raise FlagError("--environment must be at least 0")
-    progress = lambda jobs, total: track(jobs, "Rendering the shiny scenes", total)  # noqa: E731
-    write_shiny(flags.folder, flags.size, flags.num_train, flags.num_test, flags.environment, progress)
+    write_shiny(flags.folder, flags.size, flags.num_train, flags.num_test, flags.environment)
     say(f"{flags.folder}: {', '.join(SCENES)}; ns-train METHOD --data {flags.folder}/{next(iter(SCENES))}")
 
 

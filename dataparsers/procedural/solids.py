@@ -9,18 +9,17 @@ cameras see all of the surface.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from nerfloom.base.console import say, track
+from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import run_command
 from nerfloom.cli.flags import read_flags
@@ -100,7 +99,6 @@ def write_solids(
     size: int = 400,
     num_train: int = 100,
     num_test: int = 20,
-    progress: Callable[[Any, int], Any] = lambda jobs, total: jobs,
 ) -> None:
     """Write images of the solids, 8 of them for validation, and `reference.ply`, completely or not at all.
 
@@ -109,14 +107,14 @@ def write_solids(
         size: width and height of the images, pixels.
         num_train: number of training images.
         num_test: number of test images.
-        progress: wrapper of the iteration over views, called with the iterable and the number of views.
 
     Raises:
         OSError: if the folder cannot be written.
     """
     turns = {"train": (num_train, 0.0), "val": (8, 1.0), "test": (num_test, 2.0)}
     with complete_folder(folder) as temporary:
-        write_views(temporary, {split: poses_around(*t) for split, t in turns.items()}, SOLIDS, size, progress=progress)
+        poses = {split: poses_around(*turn) for split, turn in turns.items()}
+        write_views(temporary, poses, SOLIDS, size, "Rendering the solids")
         vertices, normals, faces = surface()
         columns = [*zip("xyz", vertices.float().numpy().T, strict=True)]
         columns += zip(("nx", "ny", "nz"), normals.float().numpy().T, strict=True)
@@ -158,8 +156,7 @@ def flags_of(kind: type[FlagsT], name: str, arguments: list[str]) -> FlagsT:
 
 def _command(arguments: list[str]) -> None:
     flags = flags_of(SolidsFlags, "solids", arguments)
-    progress = lambda jobs, total: track(jobs, "Rendering the solids", total)  # noqa: E731
-    write_solids(flags.folder, flags.size, flags.num_train, flags.num_test, progress)
+    write_solids(flags.folder, flags.size, flags.num_train, flags.num_test)
     say(f"{flags.folder}: images, and {REFERENCE}, their exact surface; ns-train METHOD --data {flags.folder}")
 
 

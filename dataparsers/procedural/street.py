@@ -9,9 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,8 +33,7 @@ from nerfloom.dataparsers.procedural.scene import (
     smoothstep,
 )
 from nerfloom.dataparsers.procedural.shapes import Box, Union
-from nerfloom.dataparsers.procedural.views import complete_folder, render_view
-from nerfloom.kernels.native import torch_on_one_thread
+from nerfloom.dataparsers.procedural.views import complete_folder, in_parallel, render_view
 
 ANGLE = math.radians(75.0)
 """Horizontal field of view of the cameras, radians."""
@@ -202,7 +198,6 @@ def write_street(
     cars: int = 0,
     changing: Changing,
     seed: int = 0,
-    progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
 ) -> None:
     """Write photographs of a street in nerfstudio's format, completely or not at all.
 
@@ -218,7 +213,6 @@ def write_street(
         cars: maximum number of cars near the camera of each training image.
         changing: the properties that differ between training images.
         seed: seed of houses, cameras, cars and light. The same seed gives the same bytes.
-        progress: wrapper of the iteration over images, called with the iterable, a title and their number.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -237,10 +231,7 @@ def write_street(
                 frames.append({"file_path": f"images/{name}", **mask, "transform_matrix": pose.tolist()})
                 jobs.append((temporary, frames[-1], pose, size, parts, passing, lit[number]))
         _write_transforms(temporary, size, frames, list(counts))
-        with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
-            done = pool.map(lambda job: _write_photograph(*job), jobs)
-            for _ in progress(done, "Photographing the street", len(jobs)):
-                pass
+        in_parallel(_write_photograph, jobs, "Photographing the street")
 
 
 def _write_transforms(folder: Path, size: int, frames: list[dict[str, Any]], splits: list[str]) -> None:

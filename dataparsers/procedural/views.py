@@ -9,8 +9,9 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import imageio.v3 as iio
 import numpy as np
@@ -18,9 +19,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from nerfloom.base.console import track
 from nerfloom.dataparsers.procedural.scene import DAYLIGHT, PARTS, Light, Parts, trace_rows
 from nerfloom.kernels.native import torch_on_one_thread
 
+T = TypeVar("T")
 CAMERA_ANGLE = 0.6911
 """Horizontal field of view, radians, as in NeRF-Synthetic."""
 RADIUS = 4.0
@@ -182,7 +185,6 @@ def write_dataset(
     counts: dict[str, int] | None = None,
     moving: bool = False,
     seed: int = 0,
-    progress: Callable[[Any, str, int], Any] = lambda jobs, title, total: jobs,
 ) -> None:
     """Write a data set of the embedded scene, completely or not at all; its files are as from `write_views`.
 
@@ -192,7 +194,6 @@ def write_dataset(
         counts: number of images of the splits train, val and test.
         moving: whether each frame has a time; otherwise the scene is static, at time 0.
         seed: seed of the camera positions. The same seed gives the same bytes.
-        progress: wrapper of the iteration over views, called with the iterable, a title and the number of views.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -200,9 +201,7 @@ def write_dataset(
     counts = counts or {"train": 80, "val": 8, "test": 16}
     poses = {split: camera_poses(split, count, seed) for split, count in counts.items()}
     with complete_folder(folder) as temporary:
-        write_views(
-            temporary, poses, PARTS, size, moving, lambda jobs, n: progress(jobs, "Rendering the embedded scene", n)
-        )
+        write_views(temporary, poses, PARTS, size, "Rendering the embedded scene", moving)
 
 
 def write_views(
@@ -210,8 +209,8 @@ def write_views(
     poses: Mapping[str, Sequence[npt.NDArray[np.float64]]],
     parts: Parts,
     size: int,
+    title: str,
     moving: bool = False,
-    progress: Callable[[Any, int], Any] = lambda jobs, total: jobs,
 ) -> None:
     """Write images of solids in NeRF-Synthetic's format.
 
@@ -223,14 +222,17 @@ def write_views(
         poses: camera-to-world matrices (4, 4) of each split.
         parts: the solids.
         size: width and height of the images, pixels.
+        title: title of the progress bar.
         moving: whether each frame has a time; otherwise the scene is static, at time 0.
-        progress: wrapper of the iteration over views, called with the iterable and the number of views.
     """
     jobs = [job for split, of_split in poses.items() for job in lay_out(folder, split, of_split, moving)]
-    with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:  # a view on each core
-        done = pool.map(lambda job: _write_view(*job, size=size, parts=parts), jobs)
-        for _ in progress(done, len(jobs)):
-            pass
+    in_parallel(partial(_write_view, size=size, parts=parts), jobs, title)
+
+
+def in_parallel(work: Callable[..., T], jobs: Sequence[tuple[Any, ...]], title: str) -> list[T]:
+    """Return `work(*job)` for all `jobs`, one on each core, and show the progress under a `title`."""
+    with torch_on_one_thread(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(track(pool.map(lambda job: work(*job), jobs), title, total=len(jobs)))
 
 
 @contextmanager

@@ -19,9 +19,6 @@ def read_array(path: Path) -> np.ndarray:
 
     The memory allocated is at most the size of the file, for any shape in the header.
 
-    Args:
-        path: the file.
-
     Raises:
         OSError: if the file cannot be read.
         ValueError: if it is not a .npy file, is truncated, or holds pickled objects. numpy may raise other errors.
@@ -46,7 +43,6 @@ def read_small_arrays(path: Path, wanted: Callable[[str], bool], largest: int) -
     allocated.
 
     Args:
-        path: the file.
         wanted: whether to read the array of a name.
         largest: maximum size of an array's entry, bytes uncompressed.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfloom.base.atomic import write_atomically
-from nerfloom.base.errors import DataError
+from nerfloom.base.errors import DataError, shown
 
 
 def read_json(file: Path) -> Any:
@@ -35,6 +35,29 @@ def read_object(file: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DataError(f"{file} must contain a JSON object: names and values in braces")
     return content
+
+
+def number(value: Any, name: str, where: str, positive: bool = False) -> float:
+    """Return a finite number.
+
+    Args:
+        value: the entry's value; None if it is missing.
+        name: name of the entry in the message.
+        where: name of the file and frame in the message.
+        positive: whether the number must be positive.
+
+    Raises:
+        DataError: if the value is not such a number.
+    """
+    expected = "a number above zero" if positive else "a number"
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    try:
+        result = float(value) if is_number else math.nan
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result) or (positive and result <= 0):
+        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be {expected}")
+    return result
 
 
 def write_json(path: Path, content: Any) -> None:

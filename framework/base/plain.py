@@ -109,9 +109,6 @@ class _PlainLoader(yaml.SafeLoader):
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML file that holds a mapping, with the safe loader and without aliases.
 
-    Args:
-        path: the file.
-
     Raises:
         ConfigError: if the file is missing, is not YAML or does not hold a mapping.
     """

@@ -9,7 +9,6 @@ which nerfstudio ignores). So they fit a run of the same data with another place
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, nearest, shown
-from nerfloom.base.json_files import read_json
+from nerfloom.base.json_files import number, read_json
 from nerfloom.cameras.cameras import Cameras, check_pose
 from nerfloom.cameras.framing import perspective, size_of
 from nerfloom.cameras.poses import Placement
@@ -205,7 +204,7 @@ def read_camera_path(file: Path) -> CameraPath:
     placed = [(_object(frame, label), label) for frame, label in zip(frames, labels, strict=True)]
     for frame, label in placed:
         if frame.get("aspect") is not None:
-            _number(frame, "aspect", label, above=0.0)
+            _number(frame, "aspect", label, positive=True)
     return CameraPath(
         camera_type=camera_type,
         width=width,
@@ -239,7 +238,7 @@ def read_placement(content: Any, where: str) -> Placement:
     """
     values = _object(content, where)
     transform = _rigid(values.get("transform"), f"{where}: 'transform'")
-    scale = _number(values, "scale", where, above=0.0)
+    scale = _number(values, "scale", where, positive=True)
     if not 1 / MAX_COORDINATE < scale < MAX_COORDINATE:
         raise DataError(f"{where}: 'scale' is {scale:g}, which is out of range")
     return Placement(transform, scale)
@@ -259,20 +258,11 @@ def _list(content: dict[str, Any], name: str, file: Path) -> list[Any]:
 
 
 def _number(
-    content: dict[str, Any], name: str, where: str, above: float = -math.inf, default: float | None = None
+    content: dict[str, Any], name: str, where: str, positive: bool = False, default: float | None = None
 ) -> float:
-    """Return a finite number greater than `above`; `default` if it is missing and has a default."""
+    """Return a `number` of an object; `default` if it is missing and has a default."""
     value = content.get(name)
-    if value is None and default is not None:
-        return default
-    try:
-        number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number) or not number > above:
-        kind = "a number" if above == -math.inf else f"a number above {above:g}"
-        raise DataError(f"{where}: '{name}' is {shown(value)}; it must be {kind}")
-    return number
+    return default if value is None and default is not None else number(value, name, where, positive)
 
 
 def _flag(content: dict[str, Any], name: str, where: str) -> bool:
@@ -283,7 +273,7 @@ def _flag(content: dict[str, Any], name: str, where: str) -> bool:
 
 
 def _side(content: dict[str, Any], name: str, file: Path) -> int:
-    side = _number(content, name, str(file), above=0.0)
+    side = _number(content, name, str(file), positive=True)
     if side != round(side) or not 1 <= side <= MAX_SIDE:
         raise DataError(f"{file}: '{name}' is {shown(content[name])}; it must be from 1 to {MAX_SIDE} pixels")
     return round(side)
@@ -292,9 +282,9 @@ def _side(content: dict[str, Any], name: str, file: Path) -> int:
 def _seconds(content: dict[str, Any], frames: int, where: str) -> float:
     """Return the duration, from `seconds`, or from `fps` if that is missing."""
     if content.get("seconds") is not None:
-        seconds = _number(content, "seconds", where, above=0.0)
+        seconds = _number(content, "seconds", where, positive=True)
     else:
-        seconds = frames / _number(content, "fps", where, above=0.0)
+        seconds = frames / _number(content, "fps", where, positive=True)
     slowest, fastest = SPEED_RANGE
     if not seconds * slowest <= frames <= seconds * fastest:
         raise DataError(
@@ -361,7 +351,9 @@ def _keyframes(content: dict[str, Any], camera_type: str, file: Path) -> tuple[K
                 pose=_pose(keyframe, "matrix", where),
                 fov=_fov(keyframe, camera_type, where),
                 time=None if time is None else min(max(time, 0.0), 1.0),
-                transition=None if seconds is None else _number(keyframe, "override_transition_sec", where, above=0.0),
+                transition=None
+                if seconds is None
+                else number(seconds, "override_transition_sec", where, positive=True),
             )
         )
     return tuple(found)

@@ -15,7 +15,7 @@ from nerfloom.base.arrays import read_array
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.exr import depth_channel, read_channel, read_header
-from nerfloom.data.image_files import Content, unreadable
+from nerfloom.data.image_files import Content, or_unreadable
 from nerfloom.data.suffixes import IMAGE_SUFFIXES
 
 T = TypeVar("T")
@@ -43,22 +43,36 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     """
     if not path.is_file():
         raise DataError(f"the depth image {path} does not exist")
-    stored = _or_unreadable(path, read_array) if path.suffix == ".npy" else None
+    stored = _read(path, read_array) if path.suffix == ".npy" else None
     is_exr = path.suffix.lower() == ".exr"
-    shape = _or_unreadable(path, _exr_shape if is_exr else _shape) if stored is None else stored.shape
+    shape = _read(path, _exr_shape if is_exr else _shape) if stored is None else stored.shape
     if len(shape) != 2 or 0 in shape:
         raise DataError(f"the depth image {path} has shape {shape}; it must be (height, width)")
-    if shape[0] * shape[1] > MAX_PIXELS * width * height:  # checked before memory is allocated
+    check_pixels(f"the depth image {path}", shape, width, height)
+    values = _read(path, _exr_values if is_exr else _values) if stored is None else stored
+    return _read(path, lambda _: values[nearest_pixels(shape, width, height)].astype(np.float32))
+
+
+def check_pixels(what: str, shape: Sequence[int], width: int, height: int) -> None:
+    """Check, before memory is allocated, the `shape` of the image `what` of an image of `width` x `height` pixels.
+
+    Raises:
+        DataError: if it has more than `MAX_PIXELS` times as many pixels.
+    """
+    if shape[0] * shape[1] > MAX_PIXELS * width * height:
         raise DataError(
-            f"the depth image {path} has {shape[1]} x {shape[0]} pixels, its image {width} x {height}; "
+            f"{what} has {shape[1]} x {shape[0]} pixels, its image {width} x {height}; "
             f"the limit is {MAX_PIXELS} times as many pixels"
         )
+
+
+def nearest_pixels(shape: Sequence[int], width: int, height: int) -> tuple[np.ndarray, ...]:
+    """Return the rows (H, 1) and columns (1, W) of an image of `shape` nearest to the pixels of `width` x `height`."""
     rows, columns = (
         np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)
-        for count, size in zip((height, width), shape, strict=True)
+        for count, size in zip((height, width), shape[:2], strict=True)
     )
-    values = _or_unreadable(path, _exr_values if is_exr else _values) if stored is None else stored
-    return _or_unreadable(path, lambda _: values[np.ix_(rows, columns)].astype(np.float32))
+    return np.ix_(rows, columns)
 
 
 def _shape(path: Path) -> tuple[int, ...]:
@@ -81,11 +95,8 @@ def _exr_values(path: Path) -> np.ndarray:
     return read_channel(content, header, depth_channel(header))
 
 
-def _or_unreadable(path: Path, read: Callable[[Path], T]) -> T:
-    try:
-        return read(path)
-    except Exception as error:  # as in `read_image`
-        raise unreadable(path, error, "the depth image") from error
+def _read(path: Path, read: Callable[[Path], T]) -> T:
+    return or_unreadable(path, "the depth image", lambda: read(path))
 
 
 def read_depths(paths: Sequence[Path | None], cameras: Cameras, unit: float) -> Tensor:

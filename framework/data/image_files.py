@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import imageio.v3 as iio
 import numpy as np
@@ -17,6 +18,7 @@ from nerfloom.data.suffixes import HEIF_SUFFIXES, UNREAD_SUFFIXES
 # Pillow detects the format from the content, not from the name, and would run Ghostscript, an interpreter, for EPS.
 EpsImagePlugin.gs_binary = False
 
+T = TypeVar("T")
 MAX_FILE = 2**30
 """Maximum size of an image file, bytes."""
 BAND = 64
@@ -52,9 +54,6 @@ def image_size(paths: Sequence[Path]) -> tuple[int, int]:
 
 class Content(io.BytesIO):
     """The whole content of an image file. With an open file, Pillow would allocate the bytes that a chunk claims.
-
-    Args:
-        path: the file.
 
     Raises:
         OSError: if the file cannot be read.
@@ -165,6 +164,14 @@ def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
     else:
         reason = "it is damaged or truncated; copy it again"
     return DataError(f"{name} is not a readable image: {reason}")
+
+
+def or_unreadable(path: Path, what: str, read: Callable[[], T]) -> T:
+    """Return what `read` returns; any error becomes the one of the unreadable image `path`, `what` in the message."""
+    try:
+        return read()
+    except Exception as error:  # decoders raise errors of many kinds
+        raise unreadable(path, error, what) from error
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:

@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.image_files import Content, unreadable
+from nerfloom.data.image_files import Content, or_unreadable
 
 THRESHOLD = 128
 """Minimum grey value that counts as white."""
@@ -32,10 +32,9 @@ def read_mask(path: Path, width: int, height: int) -> np.ndarray:
     """
     if not path.is_file():
         raise DataError(f"the mask {path} does not exist")
-    try:
-        grey = np.asarray(iio.imread(Content(path), plugin="pillow", mode="L", index=0))
-    except Exception as error:  # as in `read_image`
-        raise unreadable(path, error, "the mask") from error
+    grey = or_unreadable(
+        path, "the mask", lambda: np.asarray(iio.imread(Content(path), plugin="pillow", mode="L", index=0))
+    )
     if not grey.size:
         raise DataError(f"the mask {path} has no pixels")
     used = grey >= THRESHOLD

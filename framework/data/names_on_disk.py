@@ -133,6 +133,11 @@ def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[s
     return sorted(found)
 
 
+def reduced_folder(folder: Path, factor: int) -> Path:
+    """Return the folder of images reduced by a `factor`: beside the `folder` of the originals, such as images_2."""
+    return folder if factor == 1 else folder.with_name(f"{folder.name}_{factor}")
+
+
 def has_images(folder: Path) -> bool:
     """Return whether a quick look finds an image in or below `folder`. Never raises."""
     return any(_is_image(name) for _, _, names in islice(os.walk(folder), MAX_FOLDERS) for name in names)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import imageio.v3 as iio
 import numpy as np
@@ -12,10 +11,8 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.errors import DataError
-from nerfloom.data.depths import MAX_PIXELS
-from nerfloom.data.image_files import Content, unreadable
-
-T = TypeVar("T")
+from nerfloom.data.depths import check_pixels, nearest_pixels
+from nerfloom.data.image_files import Content, or_unreadable
 
 ENDING = "_normal.png"
 """End of a normal image's name, after the name of its image without the suffix."""
@@ -43,25 +40,12 @@ def read_normals(path: Path, width: int, height: int) -> Tensor:
     Raises:
         DataError: if the file is unreadable, not of 8-bit colours, or not of plausible size.
     """
-    shape = _or_unreadable(path, lambda: iio.improps(path, plugin="pillow", index=0).shape)
-    if shape[0] * shape[1] > MAX_PIXELS * width * height:  # checked before memory is allocated
-        raise DataError(
-            f"the normal image {path} has {shape[1]} x {shape[0]} pixels, its image {width} x {height}; "
-            f"the limit is {MAX_PIXELS} times as many pixels"
-        )
-    stored = _or_unreadable(path, lambda: np.asarray(iio.imread(Content(path), plugin="pillow", index=0)))
+    what = "the normal image"
+    shape = or_unreadable(path, what, lambda: iio.improps(path, plugin="pillow", index=0).shape)
+    check_pixels(f"{what} {path}", shape, width, height)
+    stored = or_unreadable(path, what, lambda: np.asarray(iio.imread(Content(path), plugin="pillow", index=0)))
     if stored.ndim != 3 or stored.shape[2] < 3 or stored.dtype != np.uint8:
         raise DataError(f"the normal image {path} must have red, green and blue of 8 bits")
-    rows, columns = (
-        np.minimum((np.arange(count) + 0.5) * size / count, size - 1).astype(np.int64)
-        for count, size in zip((height, width), stored.shape[:2], strict=True)
-    )
-    values = torch.from_numpy(stored[np.ix_(rows, columns)][..., :3].astype(np.float32)) / 127.5 - 1
+    nearest = stored[nearest_pixels(stored.shape, width, height)]
+    values = torch.from_numpy(nearest[..., :3].astype(np.float32)) / 127.5 - 1
     return torch.nn.functional.normalize(values, dim=-1)
-
-
-def _or_unreadable(path: Path, read: Callable[[], T]) -> T:
-    try:
-        return read()
-    except Exception as error:  # decoders raise errors of many kinds
-        raise unreadable(path, error, "the normal image") from error

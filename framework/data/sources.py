@@ -174,7 +174,6 @@ class ViewSource(BatchSource):
     Several processes take turns in this order.
 
     Args:
-        dataset: the images.
         background: background of transparent pixels; "random" is one colour for the whole image.
         seed: the seed of the run.
         contradicted: tiles that do not count; None if all do.

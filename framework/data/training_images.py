@@ -4,27 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from fractions import Fraction
 
 import torch
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.data.parsed_scene import ParsedScene
-
-
-def evenly_spread(total: int, count: int) -> list[int]:
-    """Return `count` of `total` indices at equal distances, including the first and the last.
-
-    Fractions are rounded, and halves to the even integer, as RegNeRF (Niemeyer et al. 2022) and FreeNeRF (Yang et al.
-    2023) choose 3, 6 or 9 training images of a capture.
-
-    Args:
-        total: number of images, 1 or more.
-        count: number of images to choose, 1 or more; all if it is more than `total`.
-    """
-    if count >= total:
-        return list(range(total))
-    return [round(Fraction(rank * (total - 1), max(count - 1, 1))) for rank in range(count)]
 
 
 def chosen_images(parsed: ParsedScene, most: int | None, indices: Sequence[int]) -> ParsedScene:

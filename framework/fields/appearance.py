@@ -96,12 +96,7 @@ class Appearance(nn.Module):
 
 
 def make_vectors(config: AppearanceConfig, scene: Scene) -> Appearance | None:
-    """Return the vectors of the training images, an input of a colour network; None if the settings have none.
-
-    Args:
-        config: the method's settings, decided.
-        scene: facts about the data.
-    """
+    """Return the vectors of the training images, an input of a colour network; None if the settings have none."""
     if config.appearance != "vector":
         return None
     size, share = config.appearance_embedding_dim, config.mean_appearance_share

@@ -71,6 +71,10 @@ class BoxField(Field):
             unit = torch.cat([unit, times[:, None].to(unit)], dim=-1)
         return self.encoding(unit)
 
+    def encoded(self, points: Points) -> Tensor:
+        """Return the features (N, E) of the encoding at N `points`; subclasses may use the points' size."""
+        return self.encode(points.positions, points.times)
+
     def _grid_density(self, network: MLP) -> GridDensity | None:
         """Return the density of `network` on the encoding; None if the kernels do not support it."""
         grid = self.encoding
@@ -106,7 +110,7 @@ class DensityField(BoxField):
         self.head = MLP(encoding.num_features, width, 1, bias=False)
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        features = self.encode(points.positions, points.times)
+        features = self.encoded(points)
         return self.head.density(features)[0], features
 
     def grid_density(self) -> GridDensity | None:
@@ -167,10 +171,6 @@ class EncodedField(BoxField):
         if reflection is None:
             inputs = num_features + levels**2 + (0 if appearance is None else appearance.size)
             self.color_head = MLP(inputs, width, width, 3, bias=False, activation="sigmoid")
-
-    def encoded(self, points: Points) -> Tensor:
-        """Return the features (N, E) of the encoding at N `points`; subclasses may use the points' size."""
-        return self.encode(points.positions, points.times)
 
     def density(self, points: Points) -> tuple[Tensor, Tensor]:
         encoded = self.encoded(points)

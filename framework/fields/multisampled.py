@@ -2,48 +2,41 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.encoded import BoxField, DensityField, EncodedField
 from nerfloom.geometry.multisamples import fixed_pattern, hashed_pattern
-from nerfloom.geometry.points import Points
+from nerfloom.geometry.points import Footprint, Points
 from nerfloom.kernels.grids.multisamples import unit_multisamples
 
 
-class MultisampledDensity(DensityField):
-    """A `DensityField` of conical frustums, for proposals; its encoding is a `MultisampledHashGrid`."""
+class MultisampledGrid(BoxField):
+    """A field of conical frustums on a hash grid.
 
-    footprint = "frustum"
+    The pattern of a frustum's points is turned by a hash of its ends in training mode, and fixed otherwise. Points
+    without a frustum count as having no size. This is a mixin, constructed like the field class beside it; the encoding
+    is a `MultisampledHashGrid`.
+    """
 
-    def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        features = encode_frustums(self, points)
-        return self.head.density(features)[0], features
-
-
-class MultisampledField(EncodedField):
-    """An `EncodedField` of conical frustums; its encoding is a `MultisampledHashGrid`."""
-
-    footprint = "frustum"
+    footprint: ClassVar[Footprint] = "frustum"
 
     def encoded(self, points: Points) -> Tensor:
-        return encode_frustums(self, points)
+        assert isinstance(self.encoding, MultisampledHashGrid)
+        cones = points.frustums
+        if cones is None:
+            unit = self.unit(points.positions)
+            return self.encoding(torch.cat([unit, torch.zeros_like(unit[:, :1])], dim=-1)[:, None])
+        pattern = hashed_pattern(cones) if self.training else fixed_pattern(cones)
+        return self.encoding(unit_multisamples(cones, pattern, self.box, self.unbounded))
 
 
-def encode_frustums(field: BoxField, points: Points) -> Tensor:
-    """Return the features (N, E) of the frustums of points; points without a frustum count as having no size.
+class MultisampledDensity(MultisampledGrid, DensityField):
+    """A field of density without colour, for proposals, at several points of each conical frustum."""
 
-    The pattern of a frustum's points is turned by a hash of its ends in training mode, and fixed otherwise.
 
-    Args:
-        field: a field on a `MultisampledHashGrid`.
-        points: N points.
-    """
-    assert isinstance(field.encoding, MultisampledHashGrid)
-    cones = points.frustums
-    if cones is None:
-        unit = field.unit(points.positions)
-        return field.encoding(torch.cat([unit, torch.zeros_like(unit[:, :1])], dim=-1)[:, None])
-    pattern = hashed_pattern(cones) if field.training else fixed_pattern(cones)
-    return field.encoding(unit_multisamples(cones, pattern, field.box, field.unbounded))
+class MultisampledField(MultisampledGrid, EncodedField):
+    """A field of density and colour at several points of each conical frustum."""

@@ -23,14 +23,8 @@ class SizedGrid(BoxField):
 
     footprint: ClassVar[Footprint] = "frustum"
 
-    def encode_points(self, points: Points) -> Tensor:
-        """Return the weighted features (N, E) of the encoding.
-
-        Args:
-            points: N points, with or without their frustums.
-        """
-        features: Tensor = self.encoding(self.balls(points)[:, None])
-        return features
+    def encoded(self, points: Points) -> Tensor:
+        return self.encoding(self.balls(points)[:, None])
 
     def balls(self, points: Points) -> Tensor:
         """Return positions and standard deviations (N, 4) in units of the encoding.
@@ -53,13 +47,6 @@ class SizedGrid(BoxField):
 class SizedDensity(SizedGrid, DensityField):
     """A field of density without colour, for proposals, on a hash grid that accounts for the size of points."""
 
-    def density(self, points: Points) -> tuple[Tensor, Tensor]:
-        features = self.encode_points(points)
-        return self.head.density(features)[0], features
-
 
 class SizedField(SizedGrid, EncodedField):
     """A field of density and colour on a hash grid that accounts for the size of points."""
-
-    def encoded(self, points: Points) -> Tensor:
-        return self.encode_points(points)

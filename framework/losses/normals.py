@@ -76,7 +76,6 @@ def penalties(rendered: Rendered, rays: Rays, field: Field) -> dict[str, Tensor]
 
     Args:
         rendered: R rendered rays with their samples and weights.
-        rays: the rays.
         field: the field that was sampled.
     """
     samples, weights = rendered.samples, rendered.weights

@@ -30,13 +30,12 @@ import numpy as np
 from nerfloom.base.console import track_bytes
 from nerfloom.base.errors import DataError
 from nerfloom.processing.aria_lens import MODEL, NAMES
-from nerfloom.processing.capture import Capture, PosedCamera, camera_pose
+from nerfloom.processing.capture import Capture, PosedCamera
 from nerfloom.processing.finite_numbers import UNUSABLE, bounded, finite_array
-from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import evenly_spaced
+from nerfloom.processing.listing import evenly_spaced, find_images
 from nerfloom.processing.point_files import GREY, MAX_POINTS
 from nerfloom.processing.record3d import rotations
-from nerfloom.processing.transforms import Lens
+from nerfloom.processing.transforms import Lens, camera_pose, rigid
 
 PROGRAM = "Aria"
 """Name for messages."""
@@ -214,9 +213,8 @@ def calibration_at(file: Path, time: int) -> tuple[np.ndarray, dict[str, float]]
     values = finite_array(numbers, (len(NAMES),), f"{file}: the lens of {LABEL}")
     if not values[0] > 0:
         raise DataError(f"{file}: the focal length of {LABEL} is not above zero")
-    pose = np.eye(4)
-    pose[:3, :3] = _rotation(finite_array(quaternion, (4,), f"{file}: the rotation of {LABEL}"), str(file))
-    pose[:3, 3] = finite_array(place, (3,), f"{file}: the place of {LABEL}")
+    rotation = _rotation(finite_array(quaternion, (4,), f"{file}: the rotation of {LABEL}"), str(file))
+    pose = rigid(rotation, finite_array(place, (3,), f"{file}: the place of {LABEL}"))
     return pose, dict(zip(NAMES, values.tolist(), strict=True))
 
 
@@ -297,10 +295,8 @@ def _between(start: Sequence[str], end: Sequence[str], share: float, what: str) 
     """Return the pose (4, 4) at a `share` of the way between two rows of `POSE`."""
     first, second = (finite_array(values, (7,), what) for values in (start, end))
     turn = second[3:] if float(first[3:] @ second[3:]) >= 0 else -second[3:]
-    pose = np.eye(4)
-    pose[:3, :3] = _rotation((1 - share) * first[3:] + share * turn, what)
-    pose[:3, 3] = (1 - share) * first[:3] + share * second[:3]
-    return pose
+    rotation = _rotation((1 - share) * first[3:] + share * turn, what)
+    return rigid(rotation, (1 - share) * first[:3] + share * second[:3])
 
 
 def _rotation(quaternion: np.ndarray, what: str) -> np.ndarray:

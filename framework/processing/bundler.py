@@ -17,7 +17,7 @@ import numpy as np
 from nerfloom.base.errors import DataError
 from nerfloom.processing.capture import Capture, PosedCamera, near_origin, relative_name
 from nerfloom.processing.finite_numbers import finite_array, nearest_rotation
-from nerfloom.processing.transforms import Lens
+from nerfloom.processing.transforms import Lens, rigid
 
 PROGRAM = "Bundler"
 """Name for messages."""
@@ -70,7 +70,7 @@ def read_capture(file: Path, listed: Path) -> Capture:
             found.append(camera)
     start = 2 + LINES_OF_CAMERA * cameras
     kept = [line.split() for line in lines[start : start + LINES_OF_POINT * points]]
-    frame = near_origin(found) if found else np.eye(4)[:3]
+    frame = near_origin(found)
     if not points:
         return Capture(PROGRAM, found, left_out, frame=frame)
     positions = finite_array(kept[::LINES_OF_POINT], (points, 3), f"{file}: the points' positions")
@@ -119,6 +119,5 @@ def _camera(name: str, rows: list[list[str]], where: str) -> PosedCamera | None:
         return None
     rotation = nearest_rotation(finite_array(rows[1:4], (3, 3), f"{where}: R"), f"{where}: R")
     translation = finite_array(rows[4], (3,), f"{where}: t")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ translation
+    pose = rigid(rotation.T, -rotation.T @ translation)
     return PosedCamera(name, pose, partial(lens_for, focal, k1, k2))

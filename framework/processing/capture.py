@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from nerfloom.base.errors import DataError
+from nerfloom.processing.finite_numbers import finite, side
 from nerfloom.processing.transforms import Lens
 
 ASPECT_TOLERANCE = 0.01
@@ -73,12 +75,17 @@ def relative_name(name: str) -> str:
     return "/".join(parts[1:] if len(parts) > 1 and parts[0].endswith(":") else parts)
 
 
-def camera_pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return camera-to-world (4, 4), OpenGL axes, from `rotation` (3, 3), y down, z ahead, and `position` (3,)."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation * [1, -1, -1]
-    pose[:3, 3] = position
-    return pose
+def undistorted_lens(size: Iterable[Any], intrinsics: Iterable[Any]) -> Lens:
+    """Return a lens without distortion, of width and height `size` and fx, fy, cx, cy `intrinsics`, pixels.
+
+    Raises:
+        TypeError, ValueError, OverflowError: if a value is invalid (`UNUSABLE`).
+    """
+    width, height = (side(value) for value in size)
+    fx, fy, cx, cy = (finite(value) for value in intrinsics)
+    if min(fx, fy) <= 0:
+        raise ValueError("a focal length must be above zero")
+    return Lens("OPENCV", {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy})
 
 
 def for_size_of(lens: Lens) -> LensOf:
@@ -103,6 +110,14 @@ def resized(lens: Lens, width: int, height: int) -> Lens:
     return Lens(lens.model, values | {"w": width, "h": height})
 
 
+def cropped(lens: Lens, crop: int) -> Lens:
+    """Return the `lens` of images with `crop` pixels cut off at each side."""
+    values = dict(lens.values)
+    for key, change in (("w", 2 * crop), ("h", 2 * crop), ("cx", crop), ("cy", crop)):
+        values[key] -= change
+    return Lens(lens.model, values)
+
+
 def spread_of(cameras: list[PosedCamera]) -> tuple[np.ndarray, float]:
     """Return the mean position (3,) of `cameras`, at least one, and the root mean square distance from it."""
     positions = np.stack([camera.pose[:3, 3] for camera in cameras])
@@ -114,14 +129,13 @@ def near_origin(cameras: list[PosedCamera]) -> np.ndarray:
     """Return the transform (3, 4) of `Capture.frame` that moves cameras near the origin if they are far from it.
 
     Coordinates of maps have millions of metres, and files of points eight digits. The origin becomes the cameras' mean
-    position, in whole units.
-
-    Args:
-        cameras: at least one.
+    position, in whole units. Fewer than two `cameras` stay where they are.
     """
     frame = np.eye(4)[:3]
+    if len(cameras) < 2:
+        return frame
     centre, spread = spread_of(cameras)
-    if np.linalg.norm(centre) > FAR * max(spread, 1e-9) and len(cameras) > 1:
+    if np.linalg.norm(centre) > FAR * max(spread, 1e-9):
         frame[:, 3] = -np.round(centre)
     return frame
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,11 +23,12 @@ from nerfloom.processing.settings import (
     ProgramFlags,
     RealityCaptureFlags,
     Record3DFlags,
+    RecordingFlags,
     VideoFlags,
-    most_images,
 )
 
 if TYPE_CHECKING:
+    from nerfloom.downloads.unpack import Place
     from nerfloom.processing.capture import Capture
     from nerfloom.processing.named_images import PlacedImages
     from nerfloom.processing.reconstruction import Reconstruction
@@ -141,32 +143,51 @@ def _as_views(state: Reconstruction, folder: Path, sources: list[Path]) -> tuple
 
 
 def _convert_polycam(flags: PolycamFlags) -> None:
-    from nerfloom.processing.archives import check_archive, unpacked
-    from nerfloom.processing.output import claim
-    from nerfloom.processing.polycam import convert, folders_of, place
+    from nerfloom.processing import polycam
+    from nerfloom.processing.named_images import images_as_named
+    from nerfloom.processing.posed_folder import write_capture
 
-    if flags.data.is_file():
-        check_archive(flags.data, place, "keyframes/images and keyframes/cameras; export Polycam's raw data")
-    else:
-        folders_of(flags.data)
-    claim(flags.output_dir, flags.data, flags.overwrite)
-    crop = flags.crop_border_pixels
-    with unpacked(flags.data, flags.output_dir, place) as export:
-        convert(export, flags.output_dir, flags.num_downscales, flags.most, flags.min_blur_score, crop)
+    needs = "keyframes/images and keyframes/cameras; export Polycam's raw data"
+    with _export(flags, polycam.place, polycam.folders_of, needs) as export:
+        images, cameras = polycam.folders_of(export)
+        capture = polycam.read_capture(images, cameras, flags.most, flags.min_blur_score)
+        placed, crop = images_as_named(capture), flags.crop_border_pixels
+        write_capture(images, capture, placed, flags.output_dir, flags.num_downscales, crop=crop)
 
 
 def _convert_record3d(flags: Record3DFlags) -> None:
+    from nerfloom.processing import record3d
+    from nerfloom.processing.named_images import images_as_named
+    from nerfloom.processing.point_files import with_points
+    from nerfloom.processing.posed_folder import write_capture
+
+    needs = "rgbd and metadata, which recordings of Record3D (.r3d) have"
+    with _export(flags, record3d.place, record3d.find_root, needs) as export:
+        root = record3d.find_root(export)
+        capture = with_points(record3d.read_capture(root, flags.most), flags.ply)
+        write_capture(root / "rgb", capture, images_as_named(capture), flags.output_dir, flags.num_downscales)
+
+
+@contextmanager
+def _export(flags: RecordingFlags, place: Place, find: Callable[[Path], object], needs: str) -> Iterator[Path]:
+    """Claim the output folder, and yield the folder of an app's export, unpacked within a `with` block.
+
+    Args:
+        flags: flags with the export, which is a folder or a zip file.
+        place: as in `unpack`.
+        find: checks that a folder is an export.
+        needs: the files that an archive must have, for messages.
+    """
     from nerfloom.processing.archives import check_archive, unpacked
     from nerfloom.processing.output import claim
-    from nerfloom.processing.record3d import convert, find_root, place
 
     if flags.data.is_file():
-        check_archive(flags.data, place, "rgbd and metadata, which recordings of Record3D (.r3d) have")
+        check_archive(flags.data, place, needs)
     else:
-        find_root(flags.data)
+        find(flags.data)
     claim(flags.output_dir, flags.data, flags.overwrite)
     with unpacked(flags.data, flags.output_dir, place) as export:
-        convert(export, flags.output_dir, flags.num_downscales, flags.most, flags.ply)
+        yield export
 
 
 def _convert_metashape(flags: MetashapeFlags) -> None:
@@ -200,7 +221,7 @@ def _convert_aria(flags: AriaFlags) -> None:
     from nerfloom.processing.aria import read_capture
     from nerfloom.processing.named_images import images_as_named
 
-    capture = read_capture(flags.data, flags.mps_data_dir, most_images(flags.max_dataset_size))
+    capture = read_capture(flags.data, flags.mps_data_dir, flags.most)
     _convert(flags, flags.data, capture, images_as_named(capture))
 
 

@@ -6,11 +6,14 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeVar
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
+T = TypeVar("T")
 READABLE = (*IMAGE_SUFFIXES, ".tga", ".ppm", ".pgm")
 """Suffixes of image files that Pillow reads (HEIC with the package pillow-heif)."""
 
@@ -36,6 +39,14 @@ def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
         files = "1 file that is not an image" if len(others) == 1 else f"{len(others)} files that are not images"
         say(f"left out: {files}{_listed(others)}")
     return images
+
+
+def evenly_spaced(items: list[T], most: int) -> list[T]:
+    """Return at most `most` evenly spaced `items`, including the first and the last; report if there are more."""
+    if len(items) <= most:
+        return items
+    say(f"{most} of {len(items)} images are taken, evenly spaced (--max-dataset-size)")
+    return [items[index] for index in evenly_spread(len(items), most)]
 
 
 def kind_of(kind: str, data: Path) -> tuple[str, Path]:

@@ -19,19 +19,11 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError, shown
 from nerfloom.base.xml_files import read_xml
-from nerfloom.processing.capture import (
-    Capture,
-    PosedCamera,
-    camera_pose,
-    for_size_of,
-    near_origin,
-    relative_name,
-    spread_of,
-)
+from nerfloom.processing.capture import Capture, PosedCamera, for_size_of, near_origin, relative_name, spread_of
 from nerfloom.processing.finite_numbers import finite_array, nearest_rotation
 from nerfloom.processing.geocentric import east_north_up, is_near_surface
 from nerfloom.processing.metashape_lens import UnsupportedSensor, lens_of
-from nerfloom.processing.transforms import Lens
+from nerfloom.processing.transforms import Lens, camera_pose
 
 PROGRAM = "Metashape"
 """Name for messages."""
@@ -84,8 +76,6 @@ def read_capture(file: Path) -> Capture:
         aligned = [each for each in aligned if each.component == largest]
     geocentric = _is_geocentric(chunks[0], aligned)
     cameras = [each.camera for each in aligned]
-    if not cameras:
-        return Capture(PROGRAM, [], left_out)
     frame = _east_north_up(cameras) if geocentric else near_origin(cameras)
     return Capture(PROGRAM, cameras, left_out, z_is_up=geocentric, frame=frame)
 

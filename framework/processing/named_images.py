@@ -34,7 +34,6 @@ def placed_images(folder: Path, capture: Capture) -> PlacedImages:
 
     Args:
         folder: folder of the photographs.
-        capture: the capture.
 
     Raises:
         DataError: if no camera has an image, or the capture has no camera.

@@ -77,8 +77,7 @@ def read_capture(file: Path) -> Capture:
         else:
             cameras.append(camera)
     points, colors = _points(part.get("points"), file)
-    frame = near_origin(cameras) if cameras else np.eye(4)[:3]
-    return Capture(PROGRAM, cameras, left_out, points, colors, z_is_up=True, frame=frame)
+    return Capture(PROGRAM, cameras, left_out, points, colors, z_is_up=True, frame=near_origin(cameras))
 
 
 def rotation_of(vector: np.ndarray) -> np.ndarray:

@@ -30,7 +30,6 @@ def with_points(capture: Capture, file: Path | None) -> Capture:
     """Return a capture with the points of a PLY file in place of its own: at most `MAX_POINTS`, evenly spaced in it.
 
     Args:
-        capture: the capture.
         file: the PLY file, or a folder of several, in the frame of the program; None leaves the capture as it is.
 
     Raises:

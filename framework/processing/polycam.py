@@ -5,6 +5,7 @@ An export is a folder, or the zip file that Polycam makes of it.
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +14,31 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import read_object
+from nerfloom.processing.capture import Capture, PosedCamera, for_size_of, undistorted_lens
 from nerfloom.processing.finite_numbers import UNUSABLE, finite
-from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import evenly_spaced, undistorted_lens, write_folder
+from nerfloom.processing.listing import evenly_spaced, find_images
 from nerfloom.processing.transforms import Lens
 
+PROGRAM = "Polycam"
+"""Name for messages."""
 Z_UP = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0]])
 """(3, 4) transform from the phone's frame (y up) to one with z up, as in nerfstudio."""
 FOLDERS = ("images", "cameras", "corrected_images", "corrected_cameras")
 """Folders in keyframes that are read."""
 
 
-def convert(export: Path, output: Path, num_downscales: int, max_images: int, min_blur_score: float, crop: int) -> None:
-    """Write a data folder from an export.
+def read_capture(images: Path, cameras: Path, max_images: int, min_blur_score: float) -> Capture:
+    """Read the cameras of an export; the name of a camera is the path of its image.
 
     Args:
-        export: the unpacked raw export.
-        output: the output folder, claimed by `output.claim`.
-        num_downscales: number of folders of reduced images.
+        images, cameras: folders of the export, from `folders_of`.
         max_images: maximum number of images, evenly spaced.
         min_blur_score: minimum of Polycam's blur score; images with a lower score are skipped as blurred.
-        crop: pixels to cut off at each side.
 
     Raises:
-        DataError: if `export` is not an export or has no usable image.
+        DataError: if a camera is invalid, or no image is usable.
     """
-    images, cameras = folders_of(export)
-    posed, blurred, without_camera = {}, 0, 0
+    found, blurred, without_camera = list[PosedCamera](), 0, 0
     for name in find_images(images):
         path = (cameras / name).with_suffix(".json")
         if not path.is_file():
@@ -49,15 +48,14 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, mi
         if blur_score_of(camera, path, min_blur_score) < min_blur_score:
             blurred += 1
             continue
-        posed[name] = (pose_of(camera, path), lens_of(camera, path))
+        found.append(PosedCamera(name.as_posix(), pose_of(camera, path), for_size_of(lens_of(camera, path))))
     if without_camera:
         say(f"{without_camera} images have no camera in {cameras} and are skipped")
     if blurred:
         say(f"{blurred} images have a blur score below {min_blur_score:g} and are skipped (--min-blur-score)")
-    if not posed:
-        raise DataError(f"{export} has no usable image; lower --min-blur-score, or export again")
-    chosen = {name: posed[name] for name in evenly_spaced(list(posed), max_images)}
-    write_folder(images, chosen, output, num_downscales, Z_UP, z_is_up=True, crop=crop)
+    if not found:
+        raise DataError(f"{images.parent} has no usable image; lower --min-blur-score, or export again")
+    return Capture(PROGRAM, evenly_spaced(found, max_images), Counter(), z_is_up=True, frame=Z_UP)
 
 
 def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
@@ -82,7 +80,7 @@ def blur_score_of(camera: dict[str, Any], path: Path, unknown: float) -> float:
 
 
 def pose_of(camera: dict[str, Any], path: Path) -> np.ndarray:
-    """Return camera-to-world (4, 4), OpenGL axes, z up, from the content `camera` of the JSON file `path`.
+    """Return camera-to-world (4, 4), OpenGL axes, y up, from the content `camera` of the JSON file `path`.
 
     Raises:
         DataError: if the pose is incomplete.
@@ -91,9 +89,7 @@ def pose_of(camera: dict[str, Any], path: Path) -> np.ndarray:
         rows = [[finite(camera[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
     except UNUSABLE as error:
         raise DataError(f"{path} has no complete pose (t_00 to t_23)") from error
-    pose = np.eye(4)
-    pose[:3] = Z_UP[:, :3] @ np.array(rows)
-    return pose
+    return np.array([*rows, [0.0, 0.0, 0.0, 1.0]])
 
 
 def lens_of(camera: dict[str, Any], path: Path) -> Lens:

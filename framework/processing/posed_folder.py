@@ -15,7 +15,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import write_json
 from nerfloom.processing import aria_lens
-from nerfloom.processing.capture import Capture, PosedCamera
+from nerfloom.processing.capture import Capture, PosedCamera, cropped
 from nerfloom.processing.images import PreparedImage, in_parallel, prepare_all, save
 from nerfloom.processing.metashape_lens import nearest
 from nerfloom.processing.named_images import PlacedImages, reasons
@@ -29,6 +29,8 @@ PANORAMA, PERSPECTIVE = "EQUIRECTANGULAR", "OPENCV"
 """Models of lenses."""
 ALWAYS_CUT = {aria_lens.MODEL}
 """Models of lenses that transforms.json cannot express."""
+VIEWS = Views(8, 90.0)
+"""Default views that images of wide lenses are cut into."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,14 @@ class _Posed:
 
 
 def write_capture(
-    folder: Path, capture: Capture, placed: PlacedImages, output: Path, num_downscales: int, views: Views, whole: bool
+    folder: Path,
+    capture: Capture,
+    placed: PlacedImages,
+    output: Path,
+    num_downscales: int,
+    views: Views = VIEWS,
+    whole: bool = False,
+    crop: int = 0,
 ) -> None:
     """Write the data folder of a capture, and report how many of its cameras are in it and why others are not.
 
@@ -50,19 +59,19 @@ def write_capture(
 
     Args:
         folder: folder of the photographs.
-        capture: the capture.
         placed: the image files of its cameras.
         output: the output folder, claimed by `output.claim`.
         num_downscales: number of folders of reduced images.
         views: views that images of wide lenses are cut into.
         whole: whether panoramas are kept as they are.
+        crop: pixels to cut off at each side of the images.
 
     Raises:
         DataError: if no image can be used, or panoramas cannot be kept because other lenses were used, too.
     """
     # Poses refer to the pixels as they are stored, so images are not turned upright.
-    prepared, unreadable = prepare_all(folder, list(placed.cameras), output / "images", upright=False)
-    posed, misfits = _with_lenses(prepared, placed.cameras, capture.frame, output / "images")
+    prepared, unreadable = prepare_all(folder, list(placed.cameras), output / "images", upright=False, crop=crop)
+    posed, misfits = _with_lenses(prepared, placed.cameras, capture.frame, output / "images", crop)
     spoilt = Counter({"with an unreadable image": len(unreadable), "with an image of another shape": len(misfits)})
     left_out = capture.left_out + placed.left_out + spoilt
     if not posed:
@@ -85,7 +94,7 @@ def write_capture(
 
 
 def _with_lenses(
-    prepared: Iterable[PreparedImage], placed: dict[Path, PosedCamera], frame: np.ndarray, images: Path
+    prepared: Iterable[PreparedImage], placed: dict[Path, PosedCamera], frame: np.ndarray, images: Path, crop: int
 ) -> tuple[list[_Posed], list[str]]:
     """Return the images with sizes that fit their cameras, and messages about the others, which are removed."""
     posed: list[_Posed] = []
@@ -93,7 +102,7 @@ def _with_lenses(
     for image in prepared:
         camera = placed[Path(image.source)]
         try:
-            lens = camera.lens(image.width, image.height)
+            lens = cropped(camera.lens(image.width + 2 * crop, image.height + 2 * crop), crop)
         except DataError as error:
             misfits.append(f"{image.source}: {error}")
             (images / image.name).unlink()

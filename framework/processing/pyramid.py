@@ -6,6 +6,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from nerfloom.data.names_on_disk import reduced_folder
 from nerfloom.processing.images import in_parallel, save
 
 
@@ -24,7 +25,7 @@ def write_pyramid(folder: Path, names: list[str], num_downscales: int, masks: bo
         with Image.open(folder / name) as image:
             image.load()
             for factor in factors:
-                target = folder.with_name(f"{folder.name}_{factor}") / name
+                target = reduced_folder(folder, factor) / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 small = reduced(image, factor)
                 save(small.point(lambda value: 255 if value == 255 else 0) if masks else small, target)

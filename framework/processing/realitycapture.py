@@ -25,7 +25,7 @@ import numpy as np
 from nerfloom.base.errors import DataError, shown
 from nerfloom.processing.capture import Capture, PosedCamera, near_origin, relative_name
 from nerfloom.processing.finite_numbers import UNUSABLE, bounded
-from nerfloom.processing.transforms import Lens
+from nerfloom.processing.transforms import Lens, rigid
 
 PROGRAM = "RealityCapture"
 """Name for messages."""
@@ -61,8 +61,7 @@ def read_capture(file: Path) -> Capture:
         raise DataError(f"{file} has no column {missing[0]!r}; {EXPORT}")
     cameras = [_camera(columns, row, f"{file}: line {line}") for line, row in rows[start + 1 :]]
     _check_lengths(cameras, file)
-    frame = near_origin(cameras) if cameras else np.eye(4)[:3]
-    return Capture(PROGRAM, cameras, Counter(), z_is_up=True, frame=frame)
+    return Capture(PROGRAM, cameras, Counter(), z_is_up=True, frame=near_origin(cameras))
 
 
 def lens_for(values: dict[str, float], width: int, height: int) -> Lens:
@@ -145,7 +144,6 @@ def _camera(columns: list[str], fields: list[str], where: str) -> PosedCamera:
         raise DataError(f"{where}: the focal length f is {values['f']:g}; it must be above zero")
     if not (name := relative_name(row.get("name", ""))):
         raise DataError(f"{where}: {shown(row.get('name'))} is not the name of an image")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_of(values["heading"], values["pitch"], values["roll"])
-    pose[:3, 3] = [values["x"], values["y"], values["alt"]]
+    rotation = rotation_of(values["heading"], values["pitch"], values["roll"])
+    pose = rigid(rotation, np.array([values["x"], values["y"], values["alt"]]))
     return PosedCamera(name, pose, partial(lens_for, values))

@@ -9,6 +9,7 @@ and its inclination is not recorded (the app's author, github.com/marek-simonik/
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +18,28 @@ import numpy as np
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import read_object
+from nerfloom.processing.capture import Capture, PosedCamera, for_size_of, undistorted_lens
 from nerfloom.processing.finite_numbers import UNUSABLE
-from nerfloom.processing.listing import find_images
-from nerfloom.processing.phone import evenly_spaced, undistorted_lens, write_folder
+from nerfloom.processing.listing import evenly_spaced, find_images
 from nerfloom.processing.polycam import Z_UP
-from nerfloom.processing.transforms import Lens, transformed
+from nerfloom.processing.transforms import Lens
+
+PROGRAM = "Record3D"
+"""Name for messages."""
 
 
-def convert(export: Path, output: Path, num_downscales: int, max_images: int, ply: Path | None = None) -> None:
-    """Write a data folder from an export.
+def read_capture(root: Path, max_images: int) -> Capture:
+    """Read the cameras of an export; the name of a camera is the path of its image in the folder rgb.
 
     An image's number is the index of its pose in metadata.json; images may be missing.
 
     Args:
-        export: the folder EXR_RGBD, or its parent.
-        output: the output folder, claimed by `output.claim`.
-        num_downscales: number of folders of reduced images.
+        root: folder of the export, from `find_root`.
         max_images: maximum number of images, evenly spaced.
-        ply: PLY file of points in the frame of the poses, or a folder of several; None for none.
 
     Raises:
-        DataError: if `export` is not an export or has no usable image, or the points cannot be used.
+        DataError: if the metadata are invalid, or no image is usable.
     """
-    root = find_root(export)
     path = root / "metadata.json"
     metadata = read_object(path)
     poses = poses_of(metadata, path)
@@ -55,9 +55,11 @@ def convert(export: Path, output: Path, num_downscales: int, max_images: int, pl
     if len(usable) < len(poses):
         say(f"{len(poses) - len(usable)} of {len(poses)} poses have no image")
     lenses = lenses_of(metadata, len(poses), path)
-    poses = transformed(poses, Z_UP)  # y is up in the image of the first camera
-    posed = {numbered[number]: (poses[number], lenses[number]) for number in evenly_spaced(usable, max_images)}
-    write_folder(root / "rgb", posed, output, num_downscales, Z_UP, z_is_up=False, points=ply)
+    cameras = [
+        PosedCamera(numbered[number].as_posix(), poses[number], for_size_of(lenses[number]))
+        for number in evenly_spaced(usable, max_images)
+    ]
+    return Capture(PROGRAM, cameras, Counter(), frame=Z_UP)  # y is up in the image of the first camera
 
 
 def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:

@@ -156,35 +156,25 @@ class VideoFlags(ColmapFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhoneFlags(OutputFlags):
-    """Flags of captures with poses."""
+class RecordingFlags(OutputFlags):
+    """Flags of recordings of a device, which has measured the poses."""
 
     max_dataset_size: int = 300
     """Maximum number of images to take, evenly spaced; -1 for all."""
 
     def check(self) -> None:
         super().check()
-        most_images(self.max_dataset_size)
+        if self.max_dataset_size < 2 and self.max_dataset_size != -1:
+            raise FlagError(f"--max-dataset-size is {self.max_dataset_size}; it must be at least 2, or -1 for all")
 
     @property
     def most(self) -> int:
         """Maximum number of images to take."""
-        return most_images(self.max_dataset_size)
-
-
-def most_images(asked: int) -> int:
-    """Return the maximum number of images of --max-dataset-size, which is `asked`, or -1 for all.
-
-    Raises:
-        FlagError: if it is out of range.
-    """
-    if asked < 2 and asked != -1:
-        raise FlagError(f"--max-dataset-size is {asked}; it must be at least 2, or -1 for all")
-    return sys.maxsize if asked == -1 else asked
+        return sys.maxsize if self.max_dataset_size == -1 else self.max_dataset_size
 
 
 @dataclass(frozen=True, kw_only=True)
-class PolycamFlags(PhoneFlags):
+class PolycamFlags(RecordingFlags):
     """Convert Polycam's raw export."""
 
     min_blur_score: float = 25.0
@@ -199,7 +189,7 @@ class PolycamFlags(PhoneFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Record3DFlags(PhoneFlags):
+class Record3DFlags(RecordingFlags):
     """Convert Record3D's export with EXR and RGBD."""
 
     ply: Path | None = None
@@ -253,17 +243,11 @@ class BundlerFlags(ProgramFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AriaFlags(ProgramFlags):
+class AriaFlags(ProgramFlags, RecordingFlags):
     """Convert images of Project Aria glasses (--data, a folder that vrs extract-all has written) with MPS's results."""
 
     mps_data_dir: Path
     """Folder of MPS's results: closed_loop_trajectory.csv, online_calibration.jsonl and, if there, semidense points,
     also in its folder slam."""
-    max_dataset_size: int = 300
-    """Maximum number of images to take, evenly spaced; -1 for all."""
     num_views: int = 1
     """Number of views cut out of an image; the first looks ahead."""
-
-    def check(self) -> None:
-        super().check()
-        most_images(self.max_dataset_size)

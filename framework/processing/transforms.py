@@ -83,13 +83,22 @@ def lens_of(model: str, width: int, height: int, parameters: Sequence[float]) ->
     return Lens(kind, ordered | {key: by_name.get(key, 0.0) for key in distortion})
 
 
+def rigid(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the rigid transform (4, 4) with a `rotation` (3, 3) and a `position` (3,)."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, position
+    return transform
+
+
+def camera_pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return camera-to-world (4, 4), OpenGL axes, from `rotation` (3, 3), y down, z ahead, and `position` (3,)."""
+    return rigid(rotation * [1, -1, -1], position)
+
+
 def opengl_pose(world_to_camera: np.ndarray) -> np.ndarray:
     """Return camera-to-world (4, 4), OpenGL axes (y up, looking along -z), of `world_to_camera` (3, 4) with y down."""
     rotation, translation = world_to_camera[:, :3], world_to_camera[:, 3]
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T * [1, -1, -1]
-    pose[:3, 3] = -rotation.T @ translation
-    return pose
+    return camera_pose(rotation.T, -rotation.T @ translation)
 
 
 def transformed(poses: np.ndarray, transform: np.ndarray) -> np.ndarray:

@@ -72,8 +72,6 @@ class Light(Appearance, ABC):
 
     Args:
         size: number D of parameters of an image.
-        config: the method's settings.
-        scene: facts about the data.
     """
 
     placed: ClassVar[bool] = False
@@ -142,12 +140,7 @@ class Light(Appearance, ABC):
 
 
 class AffineLight(Light):
-    """An affine function of colours for each image: rgb + A rgb + b. It covers exposure and white balance.
-
-    Args:
-        config: the method's settings.
-        scene: facts about the data.
-    """
+    """An affine function of colours for each image: rgb + A rgb + b. It covers exposure and white balance."""
 
     def __init__(self, config: AppearanceConfig, scene: Scene) -> None:
         super().__init__(AFFINE, config, scene)
@@ -162,10 +155,6 @@ class ToneLight(Light):
 
     Exposures start from the values in the images' files. A vector holds exposure, white balance of red and of blue,
     in units of `STOPS`, and the logarithms of the curve's slopes.
-
-    Args:
-        config: the method's settings.
-        scene: facts about the data.
     """
 
     devices: Tensor
@@ -200,12 +189,7 @@ class ToneLight(Light):
 
 
 class GridLight(Light):
-    """A bilateral grid of affine functions of colours for each image (`rendering.bilateral_grid`).
-
-    Args:
-        config: the method's settings.
-        scene: facts about the data.
-    """
+    """A bilateral grid of affine functions of colours for each image (`rendering.bilateral_grid`)."""
 
     placed = True
     cells = math.prod(GRID)
@@ -251,11 +235,6 @@ LIGHTS: dict[str, type[AffineLight] | type[ToneLight] | type[GridLight]] = {
 
 
 def make_light(config: AppearanceConfig, scene: Scene) -> Light | None:
-    """Return the light of the training images; None if the settings have no function of rendered colours.
-
-    Args:
-        config: the method's settings, decided.
-        scene: facts about the data.
-    """
+    """Return the light of the training images; None if the settings have no function of rendered colours."""
     kind = LIGHTS.get(config.appearance)
     return None if kind is None else kind(config, scene)

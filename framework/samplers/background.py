@@ -104,7 +104,6 @@ def foreground_sphere(config: BackgroundConfig, scene: Scene) -> Tensor:
     nearest camera. If the cameras look at no common point, it is the sphere around the cameras.
 
     Args:
-        config: the method's settings.
         scene: properties of the whole scene.
     """
     centre, half = scene.box.mean(0), (scene.box[1] - scene.box[0]) / 2

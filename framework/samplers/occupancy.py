@@ -145,11 +145,6 @@ class OccupancySampler(Sampler):
         self.register_load_state_dict_post_hook(lambda module, _: module.forget_all())
 
     @property
-    def occupied_share(self) -> float:
-        """Fraction of occupied cells among the cells that no smaller box covers."""
-        return int(self.occupied.sum()) / (self.slices * int(own_cells(self.levels, self.resolution).sum()))
-
-    @property
     def occupancy(self) -> Occupancy:
         """The grid in the form for `march`."""
         if self._packed is None or self._packed.occupied is not self.occupied:

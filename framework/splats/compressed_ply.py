@@ -28,6 +28,7 @@ from nerfloom.data.ply import PlyElement, PlyHeader, read_columns
 from nerfloom.kernels.splats.project import DC, DEGREES
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.smallest_three import joined
+from nerfloom.splats.stored import as_float32, logits_of_bytes
 
 CHUNK = 256
 """Gaussians in a chunk."""
@@ -68,13 +69,12 @@ def read_compressed(file: Path, header: PlyHeader) -> Gaussians:
     if set(_COLORS[0]) <= set(chunk.names):
         darkest, brightest = (np.stack(_columns(file, chunk, names, "f4"), -1)[rows] for names in _COLORS)
         shade = _between(darkest, brightest, shade)
-    opacity = (color & 255).astype(np.float64).clip(0.25, 254.75) / 255  # 0 and 1 have no logit
     return Gaussians(
-        means=_float(_between(low, high, _three(position))),
-        log_scales=_float(_between(low_scale, high_scale, _three(scale))),
-        rotations=_float(_quaternions(rotation)),
-        logits=_float(np.log(opacity / (1 - opacity))),
-        colors=_float((shade - 0.5) / DC),
+        means=as_float32(_between(low, high, _three(position))),
+        log_scales=as_float32(_between(low_scale, high_scale, _three(scale))),
+        rotations=as_float32(_quaternions(rotation)),
+        logits=logits_of_bytes(color & 255),
+        colors=as_float32((shade - 0.5) / DC),
         harmonics=_harmonics(file, header, vertex.count),
     )
 
@@ -116,9 +116,4 @@ def _harmonics(file: Path, header: PlyHeader, count: int) -> Tensor:
     bytes_ = _columns(file, element, [f"f_rest_{index}" for index in range(width)], "u1")
     stored = np.stack(bytes_, -1).astype(np.float64)
     shares = np.where(stored == 0, 0, np.where(stored == 255, 1, (stored + 0.5) / 256))
-    return _float(8 * (shares - 0.5)).reshape(count, 3, width // 3)
-
-
-def _float(values: np.ndarray) -> Tensor:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+    return as_float32(8 * (shares - 0.5)).reshape(count, 3, width // 3)

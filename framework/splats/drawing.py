@@ -47,7 +47,6 @@ def splat_camera(
         camera: one camera.
         near: Gaussians at a smaller depth are not drawn, scene units; by the unscented transform, those at a smaller
             distance.
-        look: the settings of drawing.
         pose: (3, 4) camera-to-scene pose to use instead of its own; it may require a gradient.
         reduced: ratio of the camera's image size to the drawn one's.
 
@@ -132,18 +131,15 @@ def _local_directions(
 
 
 @torch.no_grad()
-def draw_colors(
-    gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor, rasteriser: Rasteriser = RASTERISER
-) -> Tensor:
+def draw_colors(gaussians: Gaussians, camera: SplatCamera, stride: int, background: Tensor) -> Tensor:
     """Draw the colours (H, W, 3) of a picture alone, which takes less time than `draw_view`.
 
     Args:
-        gaussians: the Gaussians.
         camera: the whole image.
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.
     """
-    return every(rasteriser.draw(rasteriser.project(gaussians, camera), camera, background).image, stride)
+    return every(RASTERISER.draw(RASTERISER.project(gaussians, camera), camera, background).image, stride)
 
 
 @torch.no_grad()
@@ -154,7 +150,6 @@ def draw_view(
     """Draw a picture with depth, opacity and normals.
 
     Args:
-        gaussians: the Gaussians.
         camera: the whole image.
         stride: distance between the rows and columns that are kept, pixels.
         background: (3,) colour behind everything.

@@ -60,11 +60,7 @@ class DrawsGaussians(Renderable):
         return (NORMALS,)
 
     def gaussians_in(self, view: View) -> Gaussians:
-        """Return Gaussians that include all that a view shows, without gradient; by default all at its time.
-
-        Args:
-            view: the view.
-        """
+        """Return Gaussians that include all that a view shows, without gradient; by default all at its time."""
         return self.gaussians(view.time)
 
     def render_view(self, view: View, background: Tensor) -> Picture:
@@ -96,7 +92,6 @@ class DrawnGaussians(DrawsGaussians):
 
     Args:
         gaussians: N Gaussians in the frame of the scene.
-        look: the settings of drawing.
         scene: the scene that defines their frame.
     """
 

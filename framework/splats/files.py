@@ -162,7 +162,6 @@ def write_gaussians(
         file: path of the file, with a suffix of `SUFFIXES`; the path of a meta.json makes a folder of the format SOG.
         gaussians: N Gaussians on the CPU; for a .glb file in a frame with y up (`Placement.y_up`).
         max_megabytes: maximum size of the file in millions of bytes; None for any.
-        look: the settings of drawing.
         spz_version: version of an SPZ file.
 
     Returns:

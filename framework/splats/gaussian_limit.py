@@ -37,7 +37,6 @@ def fitted_ply(gaussians: Gaussians, most_bytes: float, look: Look = OURS) -> tu
     Args:
         gaussians: N Gaussians.
         most_bytes: maximum size of the file.
-        look: the settings of drawing.
 
     Raises:
         ConfigError: if not even one Gaussian fits.
@@ -61,7 +60,6 @@ def fitted_spz(
     Args:
         gaussians: N Gaussians on the CPU.
         most_bytes: maximum size of the file; None for any.
-        look: the settings of drawing.
         version: version of the format.
 
     Returns:

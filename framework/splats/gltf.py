@@ -44,7 +44,6 @@ def encoded_glb(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
 
     Args:
         gaussians: N finite Gaussians on the CPU, in a frame with y up.
-        look: the settings of drawing.
 
     Raises:
         ConfigError: if there are none, or the file would be larger than 4 GiB.

@@ -28,10 +28,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from nerfloom.base.errors import DataError
-from nerfloom.kernels.splats.project import DC, DEGREES
+from nerfloom.kernels.splats.project import DEGREES
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.ply import usable
-from nerfloom.splats.splat import MIN_DEVIATION
+from nerfloom.splats.stored import as_float32, colors_of_bytes, log_scales_of, logits_of_bytes
 
 HEADER = np.dtype({
     "names": ["major", "minor", "sections", "gaussians", "level", "low", "high"],
@@ -185,16 +185,12 @@ def _means(file: Path, level: int, section: _Section, buckets: bytes, stored: np
 
 
 def _gaussians(header: _Header, rows: np.ndarray, means: np.ndarray) -> Gaussians:
-    scales, color = rows["scale"].astype(np.float64), rows["color"].astype(np.float64)
-    with np.errstate(invalid="ignore"):  # values that are negative or not finite are removed later
-        log_scales = np.log(np.where(scales == 0, MIN_DEVIATION, scales))
-    opacity = color[:, 3].clip(0.25, 254.75) / 255
     return Gaussians(
-        means=_float(means),
-        log_scales=_float(log_scales),
-        rotations=_float(rows["rotation"]),
-        logits=_float(np.log(opacity / (1 - opacity))),
-        colors=_float((color[:, :3] / 255 - 0.5) / DC),
+        means=as_float32(means),
+        log_scales=log_scales_of(rows["scale"]),
+        rotations=as_float32(rows["rotation"]),
+        logits=logits_of_bytes(rows["color"][:, 3]),
+        colors=colors_of_bytes(rows["color"][:, :3]),
         harmonics=_harmonics(header, rows["harmonics"]),
     )
 
@@ -207,7 +203,7 @@ def _harmonics(header: _Header, stored: np.ndarray) -> Tensor:
         with np.errstate(invalid="ignore"):  # values that are not finite are removed later
             values = low + values / 255 * (high - low)
     bands = [values[:, :9], values[:, 9:]]
-    return torch.cat([_float(band).reshape(len(values), 3, band.shape[1] // 3) for band in bands], -1)
+    return torch.cat([as_float32(band).reshape(len(values), 3, band.shape[1] // 3) for band in bands], -1)
 
 
 def _together(parts: list[Gaussians]) -> Gaussians:
@@ -216,8 +212,3 @@ def _together(parts: list[Gaussians]) -> Gaussians:
     return Gaussians.joined([
         replace(part, harmonics=pad(part.harmonics, (0, terms - part.harmonics.shape[2]))) for part in parts
     ])  # fmt: skip
-
-
-def _float(values: np.ndarray) -> Tensor:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32))

@@ -35,7 +35,6 @@ def with_normals(shown: Projected, gaussians: Gaussians, camera: SplatCamera) ->
 
     Args:
         shown: N Gaussians on the image.
-        gaussians: the Gaussians.
         camera: camera of the image.
     """
     records, normals = shown.records, facing_normals(gaussians, camera)

@@ -45,7 +45,6 @@ def write_placed(
     Args:
         file: path of the file, with a suffix of `SUFFIXES`.
         gaussians: N Gaussians on the CPU, with centres in float64.
-        look: the settings of drawing.
         scale: the unit of their coordinates.
         placement: placement of their frame in a scene with +z up.
         max_megabytes: maximum size of the file in millions of bytes; None for any.

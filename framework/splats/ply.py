@@ -67,7 +67,6 @@ def ply_size(count: int, terms: int, look: Look = OURS) -> int:
     Args:
         count: number of Gaussians.
         terms: coefficients of degrees 1 and higher for each channel.
-        look: the settings of drawing.
     """
     names = property_names(terms)
     return (
@@ -81,7 +80,6 @@ def write_ply(file: Path, gaussians: Gaussians, look: Look = OURS) -> None:
     Args:
         file: path of the PLY file.
         gaussians: N Gaussians on the CPU.
-        look: the settings of drawing.
 
     Raises:
         OSError: if the file cannot be written.

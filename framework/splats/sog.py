@@ -42,6 +42,7 @@ from nerfloom.splats.look import ELSEWHERE, Look, discs, look_of
 from nerfloom.splats.palette import CODES
 from nerfloom.splats.ply import usable
 from nerfloom.splats.smallest_three import joined
+from nerfloom.splats.stored import as_float32, logits_of_bytes
 
 META = "meta.json"
 """Name of the file that describes the images."""
@@ -87,13 +88,12 @@ def read_sog(file: Path) -> Splats:
         logs = low + (high - low) * ((lower.astype(np.float64) + 256 * upper.astype(np.float64)) / 65535)
         means = np.sign(logs) * np.expm1(np.abs(logs))
     shade = _pixels(file, images["sh0"][0], count)
-    opacity = shade[:, 3].astype(np.float64).clip(0.25, 254.75) / 255
     gaussians = Gaussians(
-        means=_float(means),
-        log_scales=_float(_codes(file, meta, "scales")[_pixels(file, images["scales"][0], count)[:, :3]]),
-        rotations=_float(_rotations(file, _pixels(file, images["quats"][0], count))),
-        logits=_float(np.log(opacity / (1 - opacity))),
-        colors=_float(_codes(file, meta, "sh0")[shade[:, :3]]),
+        means=as_float32(means),
+        log_scales=as_float32(_codes(file, meta, "scales")[_pixels(file, images["scales"][0], count)[:, :3]]),
+        rotations=as_float32(_rotations(file, _pixels(file, images["quats"][0], count))),
+        logits=logits_of_bytes(shade[:, 3]),
+        colors=as_float32(_codes(file, meta, "sh0")[shade[:, :3]]),
         harmonics=_harmonics(file, meta, images["shN"], count) if "shN" in images else torch.zeros(count, 3, 0),
     )
     return Splats(usable(gaussians, file), _look(file, meta))
@@ -273,7 +273,7 @@ def _harmonics(file: Path, meta: dict[str, Any], contents: list[bytes], count: i
     if int(labels.max()) >= entries:
         raise DataError(f"{file} is damaged: a Gaussian has harmonics {int(labels.max()):,} of {entries:,}")
     values = _codes(file, meta, "shN")[palette.reshape(-1, terms, 3)].astype(np.float32)
-    return _float(values.transpose(0, 2, 1)[labels])
+    return as_float32(values.transpose(0, 2, 1)[labels])
 
 
 def _look(file: Path, meta: dict[str, Any]) -> Look:
@@ -287,8 +287,3 @@ def _look(file: Path, meta: dict[str, Any]) -> Look:
     if model not in ("default", "antialiased"):
         say(f"warning: {file} is of the model {shown(model)}, which is not known: drawn as 'default'")
     return replace(look, antialiased=model == "antialiased" or meta.get("antialias") is True)
-
-
-def _float(values: np.ndarray) -> Tensor:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32))

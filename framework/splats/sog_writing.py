@@ -39,7 +39,6 @@ def encoded_sog(gaussians: Gaussians, look: Look = OURS) -> tuple[bytes, list[st
 
     Args:
         gaussians: N finite Gaussians on the CPU.
-        look: the settings of drawing.
 
     Raises:
         ConfigError: if the format cannot hold them.

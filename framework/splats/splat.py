@@ -17,17 +17,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from nerfloom.base.errors import DataError
-from nerfloom.kernels.splats.project import DC
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.ply import usable
+from nerfloom.splats.stored import as_float32, colors_of_bytes, log_scales_of, logits_of_bytes
 
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 """Layout of one Gaussian."""
-MIN_DEVIATION = 1e-30
-"""Standard deviation that replaces 0, so that the logarithm is finite."""
 
 
 def read_splat(file: Path) -> Gaussians:
@@ -52,21 +49,12 @@ def read_splat(file: Path) -> Gaussians:
             f" {ROW.itemsize}; copy or export it again"
         )
     rows = np.frombuffer(content, ROW)
-    scales = rows["scale"].astype(np.float64)
-    with np.errstate(invalid="ignore"):  # values that are negative or not finite are removed below
-        log_scales = np.log(np.where(scales == 0, MIN_DEVIATION, scales))
-    color = rows["color"].astype(np.float64)
-    opacity = color[:, 3].clip(0.25, 254.75) / 255
     gaussians = Gaussians(
-        means=_float(rows["position"]),
-        log_scales=_float(log_scales),
-        rotations=_float((rows["rotation"].astype(np.float64) - 128) / 128),
-        logits=_float(np.log(opacity / (1 - opacity))),
-        colors=_float((color[:, :3] / 255 - 0.5) / DC),
+        means=as_float32(rows["position"]),
+        log_scales=log_scales_of(rows["scale"]),
+        rotations=as_float32((rows["rotation"].astype(np.float64) - 128) / 128),
+        logits=logits_of_bytes(rows["color"][:, 3]),
+        colors=colors_of_bytes(rows["color"][:, :3]),
         harmonics=torch.zeros(len(rows), 3, 0),
     )
     return usable(gaussians, file)
-
-
-def _float(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.array(values, np.float32))

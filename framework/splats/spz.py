@@ -43,6 +43,7 @@ from nerfloom.splats.look import ELSEWHERE, OURS, Look, comments, look_of
 from nerfloom.splats.ply import usable
 from nerfloom.splats.smallest_three import joined, split
 from nerfloom.splats.spz_container import MAX_GAUSSIANS, Packed, SpzVersion, packed_bytes, read_packed
+from nerfloom.splats.stored import as_float32, logits_of_bytes
 from nerfloom.splats.transform import quaternion_product
 
 BITS = (5, 4)
@@ -76,7 +77,6 @@ def encoded(gaussians: Gaussians, bits: tuple[int, int] = BITS, look: Look = OUR
     Args:
         gaussians: N finite Gaussians on the CPU.
         bits: number of bits of harmonics of degree 1 and of higher degrees, at most 8. Fewer compress better.
-        look: the settings of drawing.
         version: version of the format.
 
     Raises:
@@ -175,7 +175,7 @@ def rounded_harmonics(harmonics: Tensor, bits: tuple[int, int]) -> Tensor:
         bits: as in `encoded`.
     """
     signs = np.array(SIGNS[: harmonics.shape[2]], np.float32)
-    return _float((_rounded(harmonics.numpy() * signs, bits) / 128.0 - 1) * signs)
+    return as_float32((_rounded(harmonics.numpy() * signs, bits) / 128.0 - 1) * signs)
 
 
 def _group() -> Tensor:
@@ -242,19 +242,18 @@ def read_spz(file: Path) -> Splats:
     positions, alphas, colors, scales, rotations, harmonics = packed.arrays
     quaternions = (_first_three if packed.version < 3 else _smallest_three)(rotations)
     quaternions[:, 2:] *= -1
-    opacity = alphas[:, 0].astype(np.float64).clip(0.25, 254.75) / 255
     terms = harmonics.shape[1] // 3
     wanted = min(terms, (MAX_DEGREE + 1) ** 2 - 1)
     if wanted < terms:
         say(f"{file}: harmonics above degree {MAX_DEGREE} are left out")
     values = harmonics.reshape(packed.count, terms, 3)[:, :wanted].transpose(0, 2, 1).astype(np.float32) / 128 - 1
     gaussians = Gaussians(
-        means=_float(_positions(positions, packed) * FLIP),
-        log_scales=_float(scales / 16.0 - 10),
-        rotations=_float(quaternions),
-        logits=_float(np.log(opacity / (1 - opacity))),
-        colors=_float((colors / 255.0 - 0.5) / 0.15),
-        harmonics=_float(values * np.array(SIGNS[:wanted], np.float32)),
+        means=as_float32(_positions(positions, packed) * FLIP),
+        log_scales=as_float32(scales / 16.0 - 10),
+        rotations=as_float32(quaternions),
+        logits=logits_of_bytes(alphas[:, 0]),
+        colors=as_float32((colors / 255.0 - 0.5) / 0.15),
+        harmonics=as_float32(values * np.array(SIGNS[:wanted], np.float32)),
     )
     look = look_of(packed.comments, file, ELSEWHERE)
     return Splats(usable(gaussians, file), replace(look, antialiased=bool(packed.flags & ANTIALIASED)))
@@ -267,10 +266,6 @@ def _positions(stored: np.ndarray, packed: Packed) -> np.ndarray:
     parts = stored.reshape(packed.count, 3, 3).astype(np.int32)
     fixed = parts[:, :, 0] | parts[:, :, 1] << 8 | parts[:, :, 2] << 16
     return ((fixed ^ 0x800000) - 0x800000) * 2.0**-packed.fraction
-
-
-def _float(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
 
 
 def _first_three(stored: np.ndarray) -> np.ndarray:

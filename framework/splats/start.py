@@ -179,7 +179,6 @@ def scene_size(scene: Scene, means: Tensor | None = None, cameras: Cameras | Non
     the size is reduced in proportion to the width of the images.
 
     Args:
-        scene: facts about the data.
         means: (N, 3) centres of Gaussians, scene units; None if there are none yet.
         cameras: M training cameras, for the width of their images; None for usual lenses.
     """
@@ -199,7 +198,6 @@ def first_points(kind: Literal["points", "silhouettes", "random"], dataset: Data
     Args:
         kind: points: the points of a reconstruction. silhouettes: random ones on the surface of the visual hull of
             images with alpha. random: anywhere in the scene's box.
-        dataset: the images.
         count: number of random points, or maximum number of points of a reconstruction.
 
     Raises:

@@ -12,7 +12,7 @@ import torch
 
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import load_dataset
-from nerfloom.dataparsers.procedural import Procedural
+from nerfloom.dataparsers.procedural import Procedural, views
 from nerfloom.dataparsers.procedural.random_scenes import MAX_REACH, random_parts, scene_numbers, write_scenes
 from nerfloom.dataparsers.procedural.scene import LIGHT, PARTS, inside, trace, trace_rows
 from nerfloom.dataparsers.procedural.views import CAMERA_ANGLE, camera_poses, render_view, write_dataset
@@ -134,12 +134,13 @@ def test_the_moving_scene_starts_as_the_standing_one() -> None:
     assert (start != later).any(-1).mean() > 0.02
 
 
-def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
+def test_an_interrupted_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(jobs: object, title: str, total: int) -> object:
         raise KeyboardInterrupt
 
+    monkeypatch.setattr(views, "track", stop)
     with pytest.raises(KeyboardInterrupt):
-        write_dataset(tmp_path / "scene", size=8, counts={"train": 2}, progress=stop)
+        write_dataset(tmp_path / "scene", size=8, counts={"train": 2})
     assert list(tmp_path.iterdir()) == []
 
 

@@ -55,12 +55,14 @@ from nerfloom.geometry.regions import Box, read_region, write_region
 from nerfloom.levels.files import read_levels
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.files import read_octree, write_octree
-from nerfloom.processing import aria, bundler, metashape, opensfm, polycam, realitycapture, record3d
+from nerfloom.processing import aria, bundler, metashape, opensfm, realitycapture
 from nerfloom.processing.capture import Capture
 from nerfloom.processing.images import prepare_all
+from nerfloom.processing.kinds import process
 from nerfloom.processing.listing import find_images
 from nerfloom.processing.named_images import placed_images
 from nerfloom.processing.posed_folder import write_capture as write_placed
+from nerfloom.processing.settings import PolycamFlags, Record3DFlags
 from nerfloom.processing.views import Views
 from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
@@ -330,7 +332,8 @@ def read_photographs(folder: Path, scratch: Path) -> None:
 
 
 def convert_polycam(folder: Path, scratch: Path) -> None:
-    polycam.convert(folder, scratch / "data", 1, 100, 25.0, 3)
+    output = scratch / "data"
+    process("polycam", PolycamFlags(data=folder, output_dir=output, overwrite=True, crop_border_pixels=3))
     parse(Nerfstudio(), scratch / "data", scratch)
 
 
@@ -341,7 +344,7 @@ def write_record3d_whole(folder: Path) -> None:
 
 
 def convert_record3d(folder: Path, scratch: Path) -> None:
-    record3d.convert(folder, scratch / "data", 1, 100)
+    process("record3d", Record3DFlags(data=folder, output_dir=scratch / "data", overwrite=True))
     parse(Nerfstudio(), scratch / "data", scratch)
 
 

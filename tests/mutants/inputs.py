@@ -23,7 +23,7 @@ MUTANTS = {
         Mutant("depth-along-ray", "ray_distances", "A / cosines.clamp(min=0.001)", "A",
             "depth along the axis is taken for distance along the ray, short at the edges of pictures",
             "test_depths.py::test_a_wall_straight_ahead_is_further_along_slanted_rays"),
-        Mutant("depth-rows-columns", "read_depth", "A + 0.5", "A",
+        Mutant("depth-rows-columns", "nearest_pixels", "A + 0.5", "A",
             "depth images of another size are shifted by half a pixel of theirs",
             "truth/test_captures.py::test_a_depth_image_of_another_size_gives_what_is_at_the_pixels_middle"),
     ],
@@ -362,7 +362,7 @@ MUTANTS = {
             "a panorama passes for a capture",
             "processing/test_parallax.py::test_a_rotation_explains_a_panorama_and_no_walk"),
     ],
-    "nerfloom.processing.phone": [
+    "nerfloom.processing.capture": [
         Mutant("crop-moves-nothing", "cropped", "(('w', A), ('h', A), ('cx', crop), ('cy', crop))",
             "(('w', A), ('h', A), ('cx', 0), ('cy', 0))",
             "cropped images of ns-process-data polycam have a principal point that is off by the border",
@@ -378,8 +378,8 @@ MUTANTS = {
             "truth/test_processing.py::test_photographs_with_the_poses_and_the_lens_that_colmap_finds"),
     ],
     "nerfloom.processing.polycam": [
-        Mutant("applied-transform-identity", "convert", "Z_UP", "np.eye(4)[:3]",
-            "exports of a Polycam capture come out in another frame than Polycam's",
+        Mutant("polycam-y-stays-up", "read_capture", "Z_UP", "np.eye(4)[:3]",
+            "a Polycam capture lies on its side, and nothing estimates its up direction",
             "truth/test_processing.py::test_polycam"),
     ],
     "nerfloom.processing.pyramid": [
@@ -425,7 +425,7 @@ MUTANTS = {
         Mutant("written-fisheye-loses-k4", "lens_of", "('k1', 'k2', 'k3', 'k4')", "('k1', 'k2', 'k3')",
             "ns-process-data drops the last coefficient of a fisheye lens",
             "truth/test_lenses.py::test_colmaps_cameras_as_they_are_written_and_read"),
-        Mutant("opengl-axes-written", "opengl_pose", "A * [1, -1, -1]", "A",
+        Mutant("opengl-axes-written", "camera_pose", "A * [1, -1, -1]", "A",
             "cameras of ns-process-data look backwards",
             "processing/test_transforms_written.py::test_points_are_seen_where_colmap_sees_them"),
         Mutant("mask-of-other-name-written", "content", "'masks/'", "'images/'",

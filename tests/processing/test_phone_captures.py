@@ -16,7 +16,8 @@ import torch
 from nerfloom.base.errors import DataError
 from nerfloom.data.ply import write_points
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
-from nerfloom.processing import polycam, record3d
+from nerfloom.processing.kinds import process
+from nerfloom.processing.settings import PolycamFlags, Record3DFlags
 from tests.dataparsers.captures import POINTS, poses, worst_miss
 from tests.dataparsers.test_polycam import STAMPS, write_polycam
 from tests.dataparsers.test_record3d import COUNT, write_record3d
@@ -32,6 +33,16 @@ def spoil(file: Path, change: Callable[[Content], Any] | str) -> None:
     else:
         change(content)
         file.write_text(json.dumps(content))
+
+
+def convert_polycam(folder: Path, output: Path, most: int = 300) -> None:
+    flags = PolycamFlags(data=folder, output_dir=output, num_downscales=0, max_dataset_size=most, crop_border_pixels=0)
+    process("polycam", flags)
+
+
+def convert_record3d(folder: Path, output: Path, most: int = 300, ply: Path | None = None) -> None:
+    flags = Record3DFlags(data=folder, output_dir=output, num_downscales=0, max_dataset_size=most, ply=ply)
+    process("record3d", flags)
 
 
 CAMERAS = {
@@ -69,7 +80,7 @@ def test_polycam(name: str, tmp_path: Path) -> None:
     file = folder / "keyframes" / "cameras" / f"{STAMPS[4]}.json"
     spoil(file, CAMERAS[name])
     with pytest.raises(DataError, match=file.name):
-        polycam.convert(folder, tmp_path / "out", 0, 100, 25.0, 0)
+        convert_polycam(folder, tmp_path / "out")
     assert not (tmp_path / "out" / "transforms.json").exists()
 
 
@@ -78,21 +89,31 @@ def test_record3d(name: str, tmp_path: Path) -> None:
     folder = write_record3d(tmp_path / "recording")
     spoil(folder / "EXR_RGBD" / "metadata.json", METADATA[name])
     with pytest.raises(DataError, match=r"metadata\.json"):
-        record3d.convert(folder, tmp_path / "out", 0, 100)
-    assert not (tmp_path / "out").exists()
+        convert_record3d(folder, tmp_path / "out")
+    assert not (tmp_path / "out" / "transforms.json").exists()
 
 
-def test_an_image_of_another_shape(tmp_path: Path) -> None:
-    folder = write_polycam(tmp_path / "room")
-    spoil(folder / "keyframes" / "cameras" / f"{STAMPS[4]}.json", lambda c: c.update(width=c["height"]))
-    with pytest.raises(DataError, match=rf"{STAMPS[4]}\.jpg: it has 40x30 pixels, but its camera is for 30x30"):
-        polycam.convert(folder, tmp_path / "out", 0, 100, 25.0, 0)
+def test_images_of_another_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, reason = write_polycam(tmp_path / "room"), "it has 40x30 pixels, but its camera is for 30x30"
+    cameras = folder / "keyframes" / "cameras"
+    spoil(cameras / f"{STAMPS[4]}.json", lambda c: c.update(width=c["height"]))
+    convert_polycam(folder, tmp_path / "out")
+    assert f"1 images do not fit their cameras, the first: {STAMPS[4]}.jpg: {reason}" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    written = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert [Path(frame["source_path"]).stem for frame in written] == [*STAMPS[:4], *STAMPS[5:]]
+    assert not (tmp_path / "out" / "images" / f"{STAMPS[4]}.jpg").exists()
+    for stamp in STAMPS:
+        spoil(cameras / f"{stamp}.json", lambda c: c.update(width=c["height"]))
+    with pytest.raises(DataError, match=rf"fits its camera, the first: {STAMPS[0]}\.jpg: {reason}"):
+        convert_polycam(folder, tmp_path / "other")
 
 
 def test_reduced_images_of_record3d(tmp_path: Path) -> None:
     """They are half as large as the file says; where the first camera's up is, nobody knows."""
     folder = write_record3d(tmp_path / "recording")
-    record3d.convert(folder, tmp_path / "out", 0, 100)
+    convert_record3d(folder, tmp_path / "out")
     content = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert "orientation_override" not in content
     scene = Nerfstudio(eval_interval=0).parse(tmp_path / "out", "train")
@@ -118,14 +139,14 @@ def test_points_of_record3d_move_with_the_poses(away: float, tmp_path: Path) -> 
         write_points(
             tmp_path / "points" / f"{number}.ply", torch.from_numpy(point[None]), torch.full((1, 3), 0.25 * number)
         )
-    record3d.convert(folder, tmp_path / "out", 0, 100, tmp_path / "points")
+    convert_record3d(folder, tmp_path / "out", ply=tmp_path / "points")
     assert json.loads((tmp_path / "out" / "transforms.json").read_text())["ply_file_path"] == "sparse_pc.ply"
     scene = Nerfstudio(eval_interval=0).parse(tmp_path / "out", "train")
     assert scene.points is not None
     found = scene.placement.original_points(scene.points)
     np.testing.assert_allclose(found, expected, atol=1e-5 + 1e-6 * away)
     with pytest.raises(DataError, match="has no PLY file"):
-        record3d.convert(folder, tmp_path / "other", 0, 100, folder)
+        convert_record3d(folder, tmp_path / "other", ply=folder)
 
 
 def test_images_that_are_not_taken_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,8 +154,8 @@ def test_images_that_are_not_taken_are_counted(tmp_path: Path, capsys: pytest.Ca
     rgb = recording / "EXR_RGBD" / "rgb"
     (rgb / "cover.jpg").write_bytes((rgb / "0.jpg").read_bytes())
     (rgb / "03.jpg").write_bytes((rgb / "3.jpg").read_bytes())
-    polycam.convert(room, tmp_path / "a", 0, 4, 25.0, 0)
-    record3d.convert(recording, tmp_path / "b", 0, 5)
+    convert_polycam(room, tmp_path / "a", 4)
+    convert_record3d(recording, tmp_path / "b", 5)
     said = " ".join(capsys.readouterr().err.split())
     assert f"4 of {len(STAMPS)} images are taken" in said
     assert f"5 of {COUNT} images are taken" in said

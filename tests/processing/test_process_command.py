@@ -10,7 +10,8 @@ from PIL import Image
 
 from benchmarks.pose_errors import pose_errors
 from nerfloom.cli.process_data import main
-from nerfloom.processing.record3d import convert
+from nerfloom.processing.kinds import process
+from nerfloom.processing.settings import Record3DFlags
 from tests.conftest import Refused
 from tests.processing.scene import write_corner
 
@@ -37,8 +38,7 @@ def test_record3d_keeps_the_phones_poses(tmp_path: Path) -> None:
     matrix = [10.0, 0, 0, 0, 11.0, 0, 4.0, 3.0, 1.0]
     (root / "metadata.json").write_text(json.dumps({"w": 8, "h": 6, "K": matrix, "poses": poses}))
     output = tmp_path / "out"
-    output.mkdir()
-    convert(tmp_path, output, 1, 100)
+    process("record3d", Record3DFlags(data=tmp_path, output_dir=output, num_downscales=1))
     found = json.loads((output / "transforms.json").read_text())
     assert (found["fl_x"], found["fl_y"], found["cx"], found["cy"]) == (10, 11, 4, 3)
     # The phone's z, x and y become x, y and z.

@@ -6,13 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom.encodings.integrated import IntegratedEncoding, icosahedron_directions
+from nerfloom.encodings.integrated import IntegratedEncoding, icosahedron_directions, integrated_encoding
 from nerfloom.geometry.bounds import contract, contract_gaussians, contraction_scale
 from nerfloom.geometry.multisamples import Pattern
 from nerfloom.geometry.points import Frustums, Points, frames, sample_points
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.encodings.frequency import frequency_encoding_reference
-from nerfloom.kernels.encodings.integrated import integrated_encoding
 from nerfloom.kernels.grids.downweighting import level_weights
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.multisampled_grid import multisampled_grid

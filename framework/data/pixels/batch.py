@@ -99,7 +99,6 @@ def training_background(asked: Background | Literal["auto"], scene: Scene) -> Ba
 
     Args:
         asked: the setting.
-        scene: facts about the data.
     """
     if asked != "auto":
         return asked
@@ -197,7 +196,6 @@ def gather_batch(
     """Construct a batch from given pixels.
 
     Args:
-        dataset: the images.
         flat: (R,) numbers of the pixels, counted over all images.
         behind: (R, 3) background colours.
         subpixels: (K, 2) positions of the rays in a pixel.
@@ -224,7 +222,6 @@ def known_distances(dataset: Dataset, flat: Tensor, rays: Rays) -> Tensor | None
     """Return the measured distance (R,) along the rays of pixels, 0 where unknown; None without depth images.
 
     Args:
-        dataset: the images.
         flat: (R,) numbers of the pixels, counted over all images.
         rays: R * K rays through the pixels, with the K rays of a pixel consecutive.
     """

@@ -35,14 +35,6 @@ class PixelSet:
         return cls.of_runs(starts + first, (edges == -1).nonzero().squeeze(-1) - starts)
 
     @classmethod
-    def of_pixels(cls, pixels: Tensor) -> PixelSet:
-        """Construct from `pixels` (K,), ascending."""
-        first = torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
-        first[1:] = pixels.diff() > 1
-        ends = torch.cat([first.nonzero().squeeze(-1), torch.tensor([len(pixels)], device=pixels.device)])
-        return cls.of_runs(pixels[first], ends.diff())
-
-    @classmethod
     def joined(cls, sets: Iterable[PixelSet]) -> PixelSet:
         """Concatenate `sets`; each lies behind the one before."""
         pairs = [(part.starts, part.before.diff()) for part in sets]

@@ -46,7 +46,6 @@ def trace_octree(
         layout: where the L leaves are.
         raw: (L, 1) raw densities: the optical depth of a cell's edge is `depths_of(raw)`.
         coefficients: (L, 3 K) coefficients of K = 1, 4, 9 or 16 harmonics, channel by channel.
-        rays: the rays.
         background: (R, 3) or (3,) colour of the background.
         stop: transmittance below which a ray ends; see `error_bound`.
         deferred: collects the gradients of `raw` and `coefficients`, on compiled kernels; None to return them.

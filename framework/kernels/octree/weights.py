@@ -23,7 +23,6 @@ def raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tensor
     Args:
         layout: where the L leaves are.
         raw: (L, 1) raw densities, as in `trace_octree`.
-        rays: the rays.
         weights: (L,) largest weights so far.
         stop: transmittance below which a ray ends.
     """

@@ -39,8 +39,9 @@ from nerfloom.training.optim import learning_rate_factor
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 """Noise and penalties unless Gaussians start on surfaces. They are the values of Kheradmand et al. 2024 except the
 opacity penalty: theirs left too few Gaussians after a few hundred steps at a higher learning rate."""
-FIELD_SHARE = 0.2
-"""Maximum share of --max-seconds for training the field that Gaussians start from."""
+FIELD_SHARE, CLOSED_FIELD_SHARE = 0.2, 0.4
+"""Maximum share of --max-seconds for training the field that Gaussians start from, and where every ray ends in the
+box."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 """Initial opacity of Gaussians on a field's surfaces, and their standard deviation in mean distances to neighbours."""
 
@@ -141,7 +142,8 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             kind = "points" if dataset.points is not None else self.start_without_points()
         if kind == "field":
             with torch.enable_grad():
-                seconds = FIELD_SHARE * (self.config.max_seconds or math.inf)
+                share = CLOSED_FIELD_SHARE if self.scene.ends_in_box else FIELD_SHARE
+                seconds = share * (self.config.max_seconds or math.inf)
                 field = starting_field(self.config, dataset.scene)
                 found = found_surfaces(field, dataset, self.config, self.config.field_steps, seconds, count)
             self.found_distances.set(found.images, found.pixels, found.distances)

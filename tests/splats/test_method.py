@@ -171,6 +171,28 @@ def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None
     assert torch.equal(bits[0], bits[1])
 
 
+@pytest.mark.parametrize(("inside", "asked"), [(False, (200, 20.0)), (True, (1000, 40.0))])
+def test_a_field_has_more_time_where_every_ray_ends_in_the_box(
+    inside: bool, asked: tuple[int, float], shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 100 s: the same opaque images, with cameras in a large box or outside a small one."""
+    given: list[tuple[int, float]] = []
+
+    def found(method: Any, dataset: Any, config: Any, steps: int, seconds: float, count: int) -> FoundSurfaces:
+        given.append((steps, seconds))
+        places, first = torch.rand(50, 3), torch.zeros(50, dtype=torch.long)
+        return FoundSurfaces(places, places, first, first, torch.ones(50), None)
+
+    monkeypatch.setattr("nerfloom.methods.gaussian_splatting.found_surfaces", found)
+    half = 9.0 if inside else 1.5
+    facts = {"has_alpha": False, "unbounded": False, "box": torch.tensor([[-half] * 3, [half] * 3])}
+    trainer = said_otherwise(
+        "gaussian-splatting", shared_tiny, tmp_path, facts, start="field", field_steps="auto", max_seconds=100.0
+    )
+    trainer.prepare()
+    assert given == [pytest.approx(asked)]
+
+
 @pytest.mark.parametrize(
     ("group", "unbounded", "asked"),
     [("SE3", True, ("nerfacto", "SE3")), ("off", True, ("nerfacto", "off")), ("SE3", False, ("instant-ngp", None))],

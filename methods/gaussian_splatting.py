@@ -224,9 +224,9 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             self.shake(noise * rate * finite if isinstance(finite, Tensor) else noise * rate)
 
     def _chosen(self, given: float | None, otherwise: float) -> float:
-        """Return `given` if it is set, 0 if Gaussians started on surfaces in a bounded scene, else `otherwise`. In
-        unbounded scenes the field's distant surfaces are not reliable."""
-        on_surfaces = self._found.of(self.found) and not self.scene.unbounded
+        """Return `given` if it is set, 0 if Gaussians started on surfaces in a box that cameras see from outside, else
+        `otherwise`. The field's distant surfaces are not reliable in unbounded scenes, nor those around cameras."""
+        on_surfaces = self._found.of(self.found) and not (self.scene.unbounded or self.scene.ends_in_box)
         return given if given is not None else 0.0 if on_surfaces else otherwise
 
     def in_the_way(self, means: Tensor) -> Tensor:

@@ -116,13 +116,13 @@ class SplattingConfig(
     budget."""
     noise: float | None = None
     """Noise on the centres of nearly transparent Gaussians, relative to their learning rate. Default: 0 if Gaussians
-    start on a field's surfaces in a bounded scene, else 5e5."""
+    start on a field's surfaces in a box that cameras see from outside, else 5e5."""
     opacity_penalty: float | None = None
-    """Weight of the mean opacity in the loss. Default: 0 if Gaussians start on a field's surfaces in a bounded scene,
-    else 0.002."""
+    """Weight of the mean opacity in the loss. Default: 0 if Gaussians start on a field's surfaces in a box that cameras
+    see from outside, else 0.002."""
     scale_penalty: float | None = None
     """Weight of the mean scale, in scene extents, in the loss. Default: 0 if Gaussians start on a field's surfaces in a
-    bounded scene, else 0.01."""
+    box that cameras see from outside, else 0.01."""
     flatness_penalty: float = 0.0
     """Weight of the mean of each Gaussian's smallest scale, in scene extents, in the loss. It makes Gaussians flat, as
     in PGSR."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import ClassVar, Generic, Literal
 
 import torch
@@ -333,6 +335,8 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
             none = torch.zeros(0, dtype=torch.long, device=self.device)  # new rows, which resets Adam's state
             columns = {name: self.columns[name] for name in values}
             return [RowChange(c.values, none, c.rows(values[name], self.extent)) for name, c in columns.items()]
+        logits = gaussians.logits.masked_fill(self.in_the_way(gaussians.means), -math.inf)
+        gaussians = replace(gaussians, logits=logits)
         change = self.strategy.grow(gaussians, self.config.num_gaussians, self._extent.of(self.extent))
         if change is None:
             return ()
@@ -340,6 +344,16 @@ class GaussianModel(DrawsGaussians, Model[SplattingConfigT], Generic[SplattingCo
         if self.rows_in_view is not None and len(change.kept) + len(change.fresh):
             order = along_curve(torch.cat([gaussians.means[change.kept], change.fresh.means]))
         return row_changes(self.columns, *change, self.extent, order)
+
+    def in_the_way(self, means: Tensor) -> Tensor:
+        """Return which Gaussians (N,) bool are where nothing can be; none by default.
+
+        The strategy sees them as transparent, at each change of the number of Gaussians.
+
+        Args:
+            means: (N, 3) centres, scene coordinates.
+        """
+        return torch.zeros(len(means), dtype=torch.bool, device=means.device)
 
     def read_counts(self) -> None:
         self.capacity.read()

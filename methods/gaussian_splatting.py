@@ -26,6 +26,7 @@ from nerfloom.kernels.splats.blend import CHANNELS
 from nerfloom.losses.functions import mean_depth_error
 from nerfloom.method import DEPTH_REASONS
 from nerfloom.registry import load_method
+from nerfloom.splats.clear_space import clear_radii, in_clear_space
 from nerfloom.splats.drawing import splat_camera
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.guide import GUIDE, FoundDistances
@@ -38,8 +39,9 @@ from nerfloom.training.optim import learning_rate_factor
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
 """Noise and penalties unless Gaussians start on surfaces. They are the values of Kheradmand et al. 2024 except the
 opacity penalty: theirs left too few Gaussians after a few hundred steps at a higher learning rate."""
-FIELD_SHARE = 0.2
-"""Maximum share of --max-seconds for training the field that Gaussians start from."""
+FIELD_SHARE, CLOSED_FIELD_SHARE = 0.2, 0.4
+"""Maximum share of --max-seconds for training the field that Gaussians start from, and where every ray ends in the
+box."""
 FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
 """Initial opacity of Gaussians on a field's surfaces, and their standard deviation in mean distances to neighbours."""
 
@@ -140,11 +142,14 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             kind = "points" if dataset.points is not None else self.start_without_points()
         if kind == "field":
             with torch.enable_grad():
-                seconds = FIELD_SHARE * (self.config.max_seconds or math.inf)
+                share = CLOSED_FIELD_SHARE if self.scene.ends_in_box else FIELD_SHARE
+                seconds = share * (self.config.max_seconds or math.inf)
                 field = starting_field(self.config, dataset.scene)
                 found = found_surfaces(field, dataset, self.config, self.config.field_steps, seconds, count)
-            first = from_points(found.positions, found.colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
             self.found_distances.set(found.images, found.pixels, found.distances)
+            kept = ~self.in_the_way(found.positions)
+            places, colors = found.positions[kept], found.colors[kept]
+            first = from_points(places, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
             if not len(first):
                 say("warning: the field has no surfaces; Gaussians start anywhere in the box")
                 kind = "random"
@@ -219,10 +224,23 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
             self.shake(noise * rate * finite if isinstance(finite, Tensor) else noise * rate)
 
     def _chosen(self, given: float | None, otherwise: float) -> float:
-        """Return `given` if it is set, 0 if Gaussians started on surfaces in a bounded scene, else `otherwise`. In
-        unbounded scenes the field's distant surfaces are not reliable."""
-        on_surfaces = self._found.of(self.found) and not self.scene.unbounded
+        """Return `given` if it is set, 0 if Gaussians started on surfaces in a box that cameras see from outside, else
+        `otherwise`. The field's distant surfaces are not reliable in unbounded scenes, nor those around cameras."""
+        on_surfaces = self._found.of(self.found) and not (self.scene.unbounded or self.scene.ends_in_box)
         return given if given is not None else 0.0 if on_surfaces else otherwise
+
+    def in_the_way(self, means: Tensor) -> Tensor:
+        """Return which Gaussians (N,) bool are right before a camera, if a field has shown how near things are.
+
+        Only in a scene where every ray ends in the box, with cameras among the things that they show.
+
+        Args:
+            means: (N, 3) centres, scene coordinates.
+        """
+        poses, found = self.scene.camera_to_worlds, self.found_distances
+        if poses is None or not self.scene.ends_in_box:
+            return super().in_the_way(means)
+        return in_clear_space(means, poses.to(means), clear_radii(found.images, found.distances, len(poses)).to(means))
 
     def refined_poses(self, poses: Tensor, training: bool) -> Tensor:
         return poses if self.poses is None else self.poses.refined(poses, training)

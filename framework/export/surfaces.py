@@ -17,8 +17,9 @@ from nerfloom.method import Method
 from nerfloom.renderable import RefinesPoses, parts, refined_cameras
 from nerfloom.training.trainer import Trainer
 
-MAX_PASSES = 16
-"""Maximum number of times that rays are drawn, since some end on no surface."""
+MAX_PASSES = 32
+"""Maximum number of times that rays are drawn, since some end on no surface. Each pass draws as many rays as points are
+still missing, because rendering them can take longer than training the field."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,7 @@ def found_surfaces(
     dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras, training=True))
     passes: list[SurfacePoints] = []
     while (left := count - sum(len(one.positions) for one in passes)) > 0 and len(passes) < MAX_PASSES:
-        found = joined(surface_points(cast("Any", model), dataset, 2 * left, None))
-        passes.append(found[torch.arange(len(found.positions)) < left])
+        passes.append(joined(surface_points(cast("Any", model), dataset, left, None)))
     found, cameras = joined(iter(passes)), dataset.cameras.to("cpu")
     images = torch.searchsorted(cameras.offsets, found.pixels, right=True) - 1
     distances = (found.positions - cameras.camera_to_worlds[images, :, 3]).norm(dim=-1)

@@ -27,6 +27,9 @@ LARGE_IMAGE = 250_000
 LONG_RUN, NEVER = 15_000, 10**9
 """Minimum length of a run with resets of opacity, steps, and a period that is never reached. Recovery from a reset
 takes a thousand steps."""
+CLOSED_FIELD_STEPS, MAX_CLOSED_FIELD_STEPS = 10, 2_000
+"""Steps of a field to start from, for each second of the budget, and their maximum, if every ray ends in the box. At
+first the whole box is fog there: a ray has hundreds of samples, so a step has few rays and shows little."""
 PACED_WORDS = {True: "the time is limited, not the steps", False: "they are given, or the time has no limit"}
 RESET_WORDS = {
     True: ("the run is long", "resets of opacity", "every 3,000 steps"),
@@ -87,8 +90,8 @@ class SplattingConfig(
     """Number of Gaussians at the start; the maximum number if they start at points. Default: two thirds of
     --num-gaussians."""
     field_steps: Auto[int] = AUTO
-    """Maximum number of training steps of the field of --start field. It trains for at most a fifth of --max-seconds.
-    Default: from the budget."""
+    """Maximum number of training steps of the field of --start field. It trains for at most a fifth of --max-seconds,
+    or two fifths where every ray ends in the box. Default: from the budget."""
     rate_factor: Auto[float] = AUTO
     """Factor of all learning rates. Default: from the budget; shorter runs have a larger factor."""
     position_rate: float = 8e-5
@@ -113,13 +116,13 @@ class SplattingConfig(
     budget."""
     noise: float | None = None
     """Noise on the centres of nearly transparent Gaussians, relative to their learning rate. Default: 0 if Gaussians
-    start on a field's surfaces in a bounded scene, else 5e5."""
+    start on a field's surfaces in a box that cameras see from outside, else 5e5."""
     opacity_penalty: float | None = None
-    """Weight of the mean opacity in the loss. Default: 0 if Gaussians start on a field's surfaces in a bounded scene,
-    else 0.002."""
+    """Weight of the mean opacity in the loss. Default: 0 if Gaussians start on a field's surfaces in a box that cameras
+    see from outside, else 0.002."""
     scale_penalty: float | None = None
     """Weight of the mean scale, in scene extents, in the loss. Default: 0 if Gaussians start on a field's surfaces in a
-    bounded scene, else 0.01."""
+    box that cameras see from outside, else 0.01."""
     flatness_penalty: float = 0.0
     """Weight of the mean of each Gaussian's smallest scale, in scene extents, in the loss. It makes Gaussians flat, as
     in PGSR."""
@@ -158,12 +161,12 @@ def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingC
     detail = "large images can wait" if large else "the images are small"
     free = is_open(config.reduced_until) and is_open(config.steps_per_move) and processes().count == 1
     paced = free and config.max_seconds is not None
-    first, most = max(config.num_gaussians * 2 // 3, 1), 800 if scene.unbounded else 400
+    first = max(config.num_gaussians * 2 // 3, 1)
     resets = speed * seconds >= LONG_RUN
     config, more = fill(
         config,
         Choice("start_gaussians", first, "the others are added", "Gaussians at the start", f"{first:,}"),
-        Choice("field_steps", int(min(max(2 * seconds, 120), most)), why, "steps of a field to start from"),
+        Choice("field_steps", steps_of_field(scene, seconds), why, "steps of a field to start from"),
         Choice("paced", paced, PACED_WORDS[paced], "sizes by measured steps"),
         Choice("reduced_until", REDUCED_SHARE if large else 0.0, detail, "share of the budget with reduced images"),
         Choice("steps_per_reset", 3_000 if resets else NEVER, *RESET_WORDS[resets]),
@@ -171,3 +174,16 @@ def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingC
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
     )
     return config, made + more
+
+
+def steps_of_field(scene: Scene, seconds: float) -> int:
+    """Return the maximum number of training steps of the field that Gaussians start from.
+
+    Args:
+        scene: facts about the data.
+        seconds: the budget, seconds.
+    """
+    each, most = 2, 800 if scene.unbounded else 400
+    if scene.ends_in_box:
+        each, most = CLOSED_FIELD_STEPS, MAX_CLOSED_FIELD_STEPS
+    return int(min(max(each * seconds, 120), most))

@@ -1,5 +1,6 @@
 """Distances that a field has found: the pixels that have them, when they count, and their effect on Gaussians."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cameras.view import View
 from nerfloom.data.pixels.batch import ViewBatch
+from nerfloom.export.points import SurfacePoints
 from nerfloom.export.surfaces import found_surfaces
 from nerfloom.methods.gaussian_splatting import GaussianSplattingConfig, decide
 from nerfloom.registry import load_method
@@ -76,6 +78,25 @@ def test_what_a_field_finds_lies_on_the_rays_of_its_pixels(shared_tiny: Path, tm
     places = rays.origins + found.distances[:, None] * rays.directions
     assert torch.allclose(places, found.positions, atol=1e-4)
     assert found.motions is None
+
+
+@pytest.mark.parametrize(("end_on_a_surface", "most"), [(1, 300), (4, 1200)])
+def test_no_more_rays_are_drawn_than_points_are_missing(
+    end_on_a_surface: int, most: int, shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If one of n rays ends on a surface, n rays give a point."""
+    drawn: list[int] = []
+
+    def shown(model: Any, dataset: Any, count: int, reach: float | None) -> Iterator[SurfacePoints]:
+        drawn.append(count)
+        places = torch.rand(-(-count // end_on_a_surface), 3)
+        yield SurfacePoints(places, places, None, places, torch.zeros(len(places), dtype=torch.long))
+
+    monkeypatch.setattr("nerfloom.export.surfaces.surface_points", shown)
+    trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path, start="random", num_gaussians=100)
+    found = found_surfaces(load_method("instant-ngp"), trainer.train_set, trainer.config, 2, 60.0, 300)
+    assert len(found.positions) == 300
+    assert sum(drawn) <= most
 
 
 def test_what_a_field_finds_lies_on_the_rays_of_the_cameras_that_it_has_moved(

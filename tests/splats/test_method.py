@@ -133,6 +133,23 @@ def test_masked_pixels_teach_nothing() -> None:
     assert any(float(first.abs().sum()) > 0 for first in gradients[0])
 
 
+@pytest.mark.parametrize(
+    ("facts", "sure"),
+    [({}, True), ({"has_alpha": True}, True), ({"half": 4.0}, False), ({"unbounded": True}, False)],
+)
+def test_surfaces_of_a_field_are_sure_in_a_box_that_cameras_see_from_outside(facts: dict[str, Any], sure: bool) -> None:
+    """The camera is 3 units from the middle of the box. Where surfaces are not sure, penalties count."""
+    half = facts.get("half", 1.0)
+    changes = {"has_alpha": False, **{name: value for name, value in facts.items() if name != "half"}}
+    scene = dataclasses.replace(SCENE, box=torch.tensor([[-half] * 3, [half] * 3]), **changes)
+    scene = dataclasses.replace(scene, num_cameras=1, camera_to_worlds=camera().camera_to_worlds)
+    model = GaussianSplatting(METHOD.decided(GaussianSplattingConfig(num_gaussians=300), scene)[0], scene)
+    model.found.fill_(True)
+    batch = ViewBatch(0, View(camera()), torch.full((33, 33, 3), 0.3), torch.zeros(3))
+    terms = model.loss(batch, 0).terms.keys()
+    assert {"opacity", "scale"} & terms == (set() if sure else {"opacity", "scale"})
+
+
 def test_growth_asks_for_as_much_of_images_of_half_the_size() -> None:
     """Image positions are in units of the drawn image: its size must not change a Gaussian's growth."""
     torch.manual_seed(4)
@@ -169,6 +186,28 @@ def test_a_field_shows_where_to_start(shared_tiny: Path, tmp_path: Path) -> None
     print(psnr)
     assert psnr["field"] > psnr["random"] + 3
     assert torch.equal(bits[0], bits[1])
+
+
+@pytest.mark.parametrize(("inside", "asked"), [(False, (200, 20.0)), (True, (1000, 40.0))])
+def test_a_field_has_more_time_where_every_ray_ends_in_the_box(
+    inside: bool, asked: tuple[int, float], shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 100 s: the same opaque images, with cameras in a large box or outside a small one."""
+    given: list[tuple[int, float]] = []
+
+    def found(method: Any, dataset: Any, config: Any, steps: int, seconds: float, count: int) -> FoundSurfaces:
+        given.append((steps, seconds))
+        places, first = torch.rand(50, 3), torch.zeros(50, dtype=torch.long)
+        return FoundSurfaces(places, places, first, first, torch.ones(50), None)
+
+    monkeypatch.setattr("nerfloom.methods.gaussian_splatting.found_surfaces", found)
+    half = 9.0 if inside else 1.5
+    facts = {"has_alpha": False, "unbounded": False, "box": torch.tensor([[-half] * 3, [half] * 3])}
+    trainer = said_otherwise(
+        "gaussian-splatting", shared_tiny, tmp_path, facts, start="field", field_steps="auto", max_seconds=100.0
+    )
+    trainer.prepare()
+    assert given == [pytest.approx(asked)]
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from nerfloom.base.console import track
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_pixels
 from nerfloom.renderable import Renderable, RendersRays
@@ -74,6 +75,23 @@ def surface_points(model: RendersRays, dataset: Dataset, count: int, reach: floa
         )
 
 
+def several_passes(model: RendersRays, dataset: Dataset, count: int, passes: int) -> SurfacePoints:
+    """Return at most `count` surface points of random training pixels.
+
+    Args:
+        model, dataset: as in `surface_points`.
+        count: number of points, at least 1.
+        passes: maximum number of times that rays are drawn, since some end on no surface.
+    """
+    found, left = list[SurfacePoints](), count
+    for _ in track(range(passes), "Looking for surfaces", total=passes):
+        if left > 0:
+            drawn = joined(surface_points(model, dataset, 2 * left, None))
+            found.append(drawn[torch.arange(len(drawn.positions)) < left])
+            left -= len(found[-1].positions)
+    return joined(found)
+
+
 @torch.no_grad()
 def picture_points(model: Renderable, dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
     """Return surface points at the median depth of random pixels of rendered training views, view by view.
@@ -125,7 +143,7 @@ def _within(model: Renderable, positions: Tensor, reach: float | None) -> Tensor
     return selected
 
 
-def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
+def joined(parts: Iterable[SurfacePoints]) -> SurfacePoints:
     """Concatenate one or more `parts`; without normals if any part has none."""
     chunks = list(parts)
     normals = [chunk.normals for chunk in chunks if chunk.normals is not None]

@@ -28,7 +28,7 @@ from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.data.sources import BatchSource, Request
-from nerfloom.export.points import joined, surface_points
+from nerfloom.export.points import several_passes
 from nerfloom.geometry.alignment import nearest_rotations
 from nerfloom.method import Method
 from nerfloom.renderable import RendersRays
@@ -36,6 +36,7 @@ from nerfloom.splats.drawing import DRAWN
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.learning import number_for, rate_factor
 from nerfloom.splats.start import from_points
+from nerfloom.training.progress import take_all
 from nerfloom.training.trainer import Trainer
 
 PICTURES_SHARE = 0.45
@@ -143,7 +144,10 @@ def fit_gaussians(
     begun = time.perf_counter()
     seed_step(machine.seed, 0)
     most = number_for(seconds, MAX_GAUSSIANS)
-    points, colors = _surfaces(model, dataset, most)
+    on_surfaces = several_passes(model, dataset, most, MAX_PASSES)
+    points, colors = on_surfaces.positions.to(model.device), on_surfaces.colors.to(model.device)
+    if not len(points):
+        raise ConfigError("no training ray ends on a surface, so there is nothing to show; is the run trained?")
     shots = _shots(model, dataset, cameras, PICTURES_SHARE * seconds)
     photographs = _photographs(dataset)
     height, width = shots[0].rgb.shape[:2]
@@ -167,28 +171,11 @@ def fit_gaussians(
     trainer.prepare(start=False)
     fitted: Any = trainer.model
     fitted.set_gaussians(from_points(points, colors, MAX_DEGREE, OPACITY, SIZE))
-    steps = trainer.steps()
-    for percent in track(range(100), "Fitting Gaussians", total=100):
-        for report in steps:
-            if report.progress >= (percent + 1) / 100:
-                break
+    take_all(trainer.steps(), "Fitting Gaussians")
     found, dropped = fitted.gaussians(), trainer.state.skipped
     without = f" ({dropped:,} dropped: gradients not finite)" if dropped else ""
     say(f"{len(found):,} Gaussians after {trainer.state.step:,} steps{without}")
     return found
-
-
-def _surfaces(model: RendersRays, dataset: Dataset, count: int) -> tuple[Tensor, Tensor]:
-    """Return up to `count` points (K, 3) on surfaces and their colours (K, 3), on the model's device."""
-    positions, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    for _ in track(range(MAX_PASSES), "Looking for surfaces", total=MAX_PASSES):
-        if (left := count - sum(map(len, positions))) > 0:
-            found = joined(surface_points(model, dataset, 2 * left, None))
-            positions.append(found.positions[:left])
-            colors.append(found.colors[:left])
-    if not sum(map(len, positions)):
-        raise ConfigError("no training ray ends on a surface, so there is nothing to show; is the run trained?")
-    return torch.cat(positions).to(model.device), torch.cat(colors).to(model.device)
 
 
 # -- pictures -----------------------------------------------------------------------------------------------------

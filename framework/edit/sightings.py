@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import track
-from nerfloom.evaluation.evaluator import spread
+from nerfloom.base.evenly_spaced import spread
 from nerfloom.kernels.splats.project import Record, SplatCamera
 from nerfloom.splats.drawing import smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians

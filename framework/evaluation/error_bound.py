@@ -7,8 +7,9 @@ from contextlib import contextmanager
 
 from nerfloom.base.console import track
 from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.evenly_spaced import spread
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import spread, timed_view
+from nerfloom.evaluation.evaluator import timed_view
 from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import StopsEarly
 

@@ -18,6 +18,7 @@ from nerfloom.base.config import HeldOutAppearance
 from nerfloom.base.console import say, track
 from nerfloom.base.device import runs_ahead, wait_for
 from nerfloom.base.errors import DataError
+from nerfloom.base.evenly_spaced import spread
 from nerfloom.base.meter import time_text
 from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
@@ -329,13 +330,6 @@ def _has_kept_pixels(dataset: Dataset, index: int, half: bool) -> bool:
     """Return whether masks keep any pixel of an image, or of its right half."""
     kept = dataset.kept_of(index)
     return kept is None or bool((right_half(kept) if half else kept).any())
-
-
-def spread(total: int, limit: int | None) -> list[int]:
-    """Return at most `limit` of the numbers 0 to `total` - 1, evenly spaced; all if `limit` is None."""
-    if limit is None or limit >= total:
-        return list(range(total))
-    return [index * total // limit for index in range(limit)]
 
 
 def _row(dataset: Dataset, index: int, measured: Measured, seconds: float) -> dict[str, Any]:

@@ -16,9 +16,10 @@ from statistics import fmean
 from typing import Any, TypeAlias
 
 from nerfloom.base.device import runs_ahead
+from nerfloom.base.evenly_spaced import spread
 from nerfloom.base.json_files import finite_or_null
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import Measured, measure_view, spread, views_to_judge
+from nerfloom.evaluation.evaluator import Measured, measure_view, views_to_judge
 from nerfloom.renderable import Renderable, with_refined_poses
 from nerfloom.training.progress import StepReport
 

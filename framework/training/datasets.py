@@ -6,10 +6,10 @@ import torch
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.evenly_spaced import spread
 from nerfloom.base.splits import Split
 from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.pixels.cache import PixelMemory
-from nerfloom.evaluation.evaluator import spread
 from nerfloom.training.run import Run
 
 

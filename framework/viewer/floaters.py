@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.evenly_spaced import spread
 from nerfloom.data.sparse_depth import sparse_depth
 from nerfloom.edit.drop import floating
 from nerfloom.edit.edited import Edited
-from nerfloom.evaluation.evaluator import CLEAR_SHARE, spread
+from nerfloom.evaluation.evaluator import CLEAR_SHARE
 from nerfloom.renderable import RendersRays
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.loaded import Loaded

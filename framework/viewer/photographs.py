@@ -16,13 +16,13 @@ from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import NerfloomError
+from nerfloom.base.evenly_spaced import spread
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import Ndc, NdcCameras
 from nerfloom.cameras.view import View
 from nerfloom.data.image_files import Content, read_image
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.evaluator import spread
 from nerfloom.renderable import Renderable, refined_cameras
 from nerfloom.training.run import Run
 from nerfloom.viewer.request import Pose

@@ -100,6 +100,11 @@ MUTANTS = {
             "errors of lengths are too large by the root of two",
             "test_triangulation.py::test_the_covariance_is_that_of_least_squares"),
     ],
+    "nerfloom.base.evenly_spaced": [
+        Mutant("spread-first-views", "spread", "[index * total // limit for index in A]", "list(A)",
+            "--max-images judges the first views alone",
+            "evaluation/test_evaluator.py::test_pictures_are_of_views_evenly_spaced_and_of_the_worst"),
+    ],
     "nerfloom.edit.drop": [
         Mutant("floaters-however-opaque", "floating", "A & (seen.opacity_in_front <= max_opacity)", "A",
             "what is seen before other things is dropped, even if it is opaque",
@@ -145,9 +150,6 @@ MUTANTS = {
         Mutant("masked-windows-count", "measure", "quick_ssim(A, B, kept)", "quick_ssim(A, B)",
             "what masks ignore counts as perfect in SSIM",
             "test_masks.py::test_ignored_pixels_do_not_count_in_evaluation"),
-        Mutant("spread-first-views", "spread", "[index * total // limit for index in A]", "list(A)",
-            "--max-images judges the first views alone",
-            "evaluation/test_evaluator.py::test_pictures_are_of_views_evenly_spaced_and_of_the_worst"),
         Mutant("few-called-all", "evaluate", "{'num_images': A, 'num_images_in_split': len(views)}",
             "{'num_images': A, 'num_images_in_split': A}",
             "an evaluation of some images is said to be of all",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from nerfloom.base.console import say
@@ -23,9 +24,6 @@ if TYPE_CHECKING:
     from nerfloom.geometry.regions import Region
     from nerfloom.training.loaded import Loaded
 
-    Writer = Callable[[Loaded, Path, Any, Sequence[Region]], None]
-    """Function that writes a file, of the scene to export, the file, settings and regions."""
-
 MESHES = (".ply", ".obj", ".glb")
 """Suffixes of meshes."""
 
@@ -37,10 +35,11 @@ class Kind(NamedTuple):
     """Class of its settings."""
     suffixes: tuple[str, ...]
     """Suffixes that its file may have."""
-    writer: Callable[[], Writer]
-    """Imports the function that writes the file, and returns it."""
-    is_cropped: bool = False
-    """Whether it takes regions."""
+    writer: str
+    """Module in this room and function of the scene to export, the file and settings, which writes the file. They are
+    imported on use, so that the help of the command is fast."""
+    is_cropped: bool = True
+    """Whether that function takes regions, too."""
 
 
 def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequence[Region] = ()) -> None:
@@ -68,7 +67,8 @@ def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequen
     path.parent.mkdir(parents=True, exist_ok=True)
     if loaded.scale.is_known:
         say(loaded.scale.words())
-    kind.writer()(loaded, path, settings, regions)
+    write = resolve_name(f"nerfloom.export.{kind.writer}")
+    write(loaded, path, settings, *([regions] if kind.is_cropped else []))
 
 
 def check_scale(loaded: Loaded) -> None:
@@ -92,67 +92,14 @@ def kind_named(name: str) -> Kind:
     return KINDS[name]
 
 
-# Each imports on use, so that the help of the command is fast.
-
-
-def _points() -> Writer:
-    from nerfloom.export.point_cloud import export_points
-
-    return export_points
-
-
-def _level_set() -> Writer:
-    from nerfloom.export.run_mesh import export_level_set
-
-    return export_level_set
-
-
-def _fused() -> Writer:
-    from nerfloom.export.run_mesh import export_fused
-
-    return export_fused
-
-
-def _gaussians() -> Writer:
-    from nerfloom.export.run_gaussians import export_gaussians
-
-    return export_gaussians
-
-
-def _levels() -> Writer:
-    from nerfloom.export.run_levels import export_levels
-
-    return export_levels
-
-
-def _cameras() -> Writer:
-    from nerfloom.export.run_cameras import export_cameras
-
-    return lambda loaded, path, settings, _: export_cameras(loaded, path, settings)
-
-
-def _occupancy() -> Writer:
-    from nerfloom.export.run_occupancy import export_occupancy
-
-    return lambda loaded, path, settings, _: export_occupancy(loaded, path, settings)
-
-
-def _page() -> Writer:
-    from nerfloom.export.run_page import export_page
-    from nerfloom.registry import load_method
-
-    splatting = load_method("gaussian-splatting")
-    return lambda loaded, path, settings, regions: export_page(loaded, path, settings, splatting, regions)
-
-
 KINDS: dict[str, Kind] = {
-    "pointcloud": Kind(PointSettings, (".ply",), _points, is_cropped=True),
-    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set, is_cropped=True),
-    "tsdf": Kind(TsdfSettings, MESHES, _fused, is_cropped=True),
-    "gaussian-splat": Kind(SplatSettings, (".ply", ".spz", ".sog", ".glb"), _gaussians, is_cropped=True),
-    "levels": Kind(LevelsSettings, (".levels",), _levels, is_cropped=True),
-    "cameras": Kind(CameraSettings, (".json",), _cameras),
-    "occupancy": Kind(OccupancySettings, (".npz",), _occupancy),
-    "web": Kind(WebSettings, (".html",), _page, is_cropped=True),
+    "pointcloud": Kind(PointSettings, (".ply",), "point_cloud:export_points"),
+    "marching-cubes": Kind(MarchingCubesSettings, MESHES, "run_mesh:export_level_set"),
+    "tsdf": Kind(TsdfSettings, MESHES, "run_mesh:export_fused"),
+    "gaussian-splat": Kind(SplatSettings, (".ply", ".spz", ".sog", ".glb"), "run_gaussians:export_gaussians"),
+    "levels": Kind(LevelsSettings, (".levels",), "run_levels:export_levels"),
+    "cameras": Kind(CameraSettings, (".json",), "run_cameras:export_cameras", is_cropped=False),
+    "occupancy": Kind(OccupancySettings, (".npz",), "occupancy:export_occupancy", is_cropped=False),
+    "web": Kind(WebSettings, (".html",), "run_page:export_page"),
 }
 """Kinds of export by name."""

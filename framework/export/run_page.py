@@ -37,10 +37,10 @@ from nerfloom.export.web import (
 )
 from nerfloom.geometry.regions import Region
 from nerfloom.levels.drawn import DrawnLevels
-from nerfloom.method import Method
 from nerfloom.octrees.drawn import DrawnOctree, DrawsOctree
 from nerfloom.octrees.files import MAX_BYTES
 from nerfloom.octrees.octree import Octree
+from nerfloom.registry import load_method
 from nerfloom.renderable import Renderable, RendersRays, with_refined_poses
 from nerfloom.scene.folded_poses import in_order
 from nerfloom.splats.drawing import smallest_depth
@@ -53,9 +53,7 @@ PICTURE_SUFFIX = ".jpg"
 """Suffix of the picture of link previews, beside the page."""
 
 
-def export_page(
-    loaded: Loaded, path: Path, settings: WebSettings, splatting: Method, regions: Sequence[Region] = ()
-) -> None:
+def export_page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequence[Region] = ()) -> None:
     """Write the web page of a run, a file of Gaussians or an octree, and say its size and how close it comes.
 
     A JPEG file of the start view, for link previews, is written beside it, and of levels the folder of chunks.
@@ -64,7 +62,6 @@ def export_page(
         loaded: the run or file.
         path: file to write.
         settings: settings of the page.
-        splatting: the method that fits Gaussians to a field.
         regions: the page shows their intersection, in the frame of exports; it is then not compared.
 
     Raises:
@@ -103,7 +100,7 @@ def export_page(
         octree = _octree(loaded, settings.fit_seconds, room(facts, settings.max_megabytes))
         page = octree_page(loaded, octree, cameras, facts, turn, settings.max_megabytes, regions)
     else:
-        found, look = _gaussians(loaded, dataset, cameras, settings.fit_seconds, moment, splatting)
+        found, look = _gaussians(loaded, dataset, cameras, settings.fit_seconds, moment)
         page = gaussian_page(loaded, found, look, facts, turn, settings.max_megabytes, regions)
     for cost in page.costs:
         say(cost)
@@ -182,7 +179,7 @@ def _say_closeness(
 
 
 def _gaussians(
-    loaded: Loaded, dataset: Dataset | None, cameras: Cameras, seconds: float, moment: float | None, splatting: Method
+    loaded: Loaded, dataset: Dataset | None, cameras: Cameras, seconds: float, moment: float | None
 ) -> tuple[Gaussians, Look]:
     """Return the Gaussians of a run or file, or Gaussians fitted to its field, and how they are drawn."""
     model = loaded.model
@@ -193,7 +190,8 @@ def _gaussians(
     if dataset is None:
         raise ConfigError("--kind gaussians: they are fitted at the cameras of photographs: give --data DIR")
     _check_seconds(seconds)
-    return fit_gaussians(model, splatting, dataset, cameras, seconds, loaded.run.config.machine), OURS
+    splatting, machine = load_method("gaussian-splatting"), loaded.run.config.machine
+    return fit_gaussians(model, splatting, dataset, cameras, seconds, machine), OURS
 
 
 def _octree(loaded: Loaded, seconds: float, max_bytes: float) -> Octree:

@@ -48,6 +48,7 @@ from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.training.datasets import first_split
 from nerfloom.training.loaded import Loaded
+from nerfloom.training.run_path import data_name
 
 PICTURE_SUFFIX = ".jpg"
 """Suffix of the picture of link previews, beside the page."""
@@ -235,7 +236,7 @@ def _title(loaded: Loaded) -> str:
     if not loaded.is_run:
         return printable(loaded.origin.stem)
     config = loaded.run.config
-    experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
+    experiment = config.experiment_name or data_name(config.data)
     return printable(f"{experiment} · {loaded.method}")
 
 

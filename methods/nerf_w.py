@@ -115,11 +115,7 @@ class NerfW(RefinedModel[NerfWConfig], plain=True):
 
 
 def decide(config: NerfWConfig, scene: Scene) -> tuple[NerfWConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene."""
     config, scaled = fill(config, Choice("gradient_scaling", True, "things near one camera may be in its image alone"))
     config, made = decide_capture(config, scene)
     config, samples = decide_samples(config, SAMPLES)

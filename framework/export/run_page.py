@@ -21,6 +21,7 @@ from nerfloom.export.bake import Baking, bake
 from nerfloom.export.levels_page import levels_page
 from nerfloom.export.page_closeness import closeness
 from nerfloom.export.page_scenes import BEYOND_THE_BOX, ScenePage, gaussian_page, octree_page
+from nerfloom.export.run_gaussians import moment_of
 from nerfloom.export.settings import WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
@@ -211,20 +212,6 @@ def _octree(loaded: Loaded, seconds: float, max_bytes: float) -> Octree:
 def _check_seconds(seconds: float) -> None:
     if not seconds > 0:
         raise FlagError(f"--fit-seconds is {seconds:g}; it must be positive")
-
-
-def moment_of(moving: bool, asked: float | None) -> float | None:
-    """Return the time `asked` for, of photographs that have times if `moving`; None of a static scene.
-
-    Raises:
-        ConfigError: if a static scene was asked for a time.
-        FlagError: if the time is not from 0 to 1.
-    """
-    if asked is not None and not moving:
-        raise ConfigError(f"--time {asked:g}: the photographs of this run have no times")
-    if asked is not None and not 0 <= asked <= 1:
-        raise FlagError(f"--time is {asked:g}; it must be from 0 to 1")
-    return (asked or 0.0) if moving else None
 
 
 def _at(dataset: Dataset, moment: float | None) -> Dataset:

@@ -56,7 +56,7 @@ MUTANTS = {
             "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
     ],
     "nerfloom.viewer.beside": [
-        Mutant("another-place", "draw_beside", "request.moved(*A)", "request",
+        Mutant("another-place", "draw_other", "request.moved(*A)", "request",
             "the second run is seen from another place than the first",
             "viewer/test_beside.py::test_what_is_the_same_looks_the_same_in_both_scenes"),
     ],

@@ -35,7 +35,7 @@ from nerfloom.renderable import RendersRays
 from nerfloom.splats.drawing import DRAWN
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.learning import number_for, rate_factor
-from nerfloom.splats.start import from_points
+from nerfloom.splats.start import on_surfaces
 from nerfloom.training.progress import take_all
 from nerfloom.training.trainer import Trainer
 
@@ -55,8 +55,6 @@ BETWEEN = 4
 """Every Nth picture is from between two cameras."""
 MAX_PASSES = 4
 """Maximum number of rounds of drawing rays, since some rays hit no surface."""
-OPACITY, SIZE = 0.5, 0.7
-"""Initial opacity of Gaussians, and their standard deviation in mean distances to neighbours."""
 MAX_GAUSSIANS, MAX_RATE = 300_000, 5.0
 """Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 STEPS_PER_SECOND = 25
@@ -144,8 +142,8 @@ def fit_gaussians(
     begun = time.perf_counter()
     seed_step(machine.seed, 0)
     most = number_for(seconds, MAX_GAUSSIANS)
-    on_surfaces = several_passes(model, dataset, most, MAX_PASSES)
-    points, colors = on_surfaces.positions.to(model.device), on_surfaces.colors.to(model.device)
+    surfaces = several_passes(model, dataset, most, MAX_PASSES)
+    points, colors = surfaces.positions.to(model.device), surfaces.colors.to(model.device)
     if not len(points):
         raise ConfigError("no training ray ends on a surface, so there is nothing to show; is the run trained?")
     shots = _shots(model, dataset, cameras, PICTURES_SHARE * seconds)
@@ -170,7 +168,7 @@ def fit_gaussians(
     trainer = Trainer(splatting, config, learnt, source=FieldPictures(learnt, shots, photographs, model.background))
     trainer.prepare(start=False)
     fitted: Any = trainer.model
-    fitted.set_gaussians(from_points(points, colors, MAX_DEGREE, OPACITY, SIZE))
+    fitted.set_gaussians(on_surfaces(points, colors, MAX_DEGREE))
     take_all(trainer.steps(), "Fitting Gaussians")
     found, dropped = fitted.gaussians(), trainer.state.skipped
     without = f" ({dropped:,} dropped: gradients not finite)" if dropped else ""

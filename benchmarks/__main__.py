@@ -27,7 +27,7 @@ from nerfloom.base.errors import ConfigError, FlagError, shown
 from nerfloom.base.extras import install_command
 from nerfloom.cli.bench_results import run_benchmark, write_results
 from nerfloom.cli.common import check_weights, make_room, run_command
-from nerfloom.training.run_path import trained_run
+from nerfloom.training.run_path import data_name, trained_run
 
 USAGE = """\
 usage: python -m benchmarks WHAT [flags]
@@ -71,7 +71,7 @@ def _curves(flags: CurvesFlags) -> None:
     from nerfloom.base.console import console
     from nerfloom.comparison import plots
 
-    name = "procedural" if flags.data is None else flags.data.resolve().name
+    name = data_name(flags.data)
     folder = flags.run_dir or Path("outputs") / f"curves-{name}"
     path, picture = flags.output_dir / f"curves-{name}.json", flags.plot_dir / f"curves-{name}.svg"
     plans = curves.plans(flags.methods, flags.data, flags.budgets, flags.seeds, flags.views, folder)

@@ -110,11 +110,7 @@ class DNeRF(RayModel[DNeRFConfig], LearnsMotion, plain=True):
 
 
 def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene."""
     grid = config.canonical == "hash-grid" and not (scene.moving and config.variant == "t-nerf")
     network = f"the canonical field is a {'hash grid' if grid else 'network'}"
     chosen = sampler_choice(config, scene.unbounded)

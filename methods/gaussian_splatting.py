@@ -33,7 +33,7 @@ from nerfloom.splats.guide import GUIDE, FoundDistances
 from nerfloom.splats.learning import open_degree
 from nerfloom.splats.resolution import enlarged, reduced, reduced_distances, reduced_weights
 from nerfloom.splats.settings import SplattingConfig, decide_splatting
-from nerfloom.splats.start import PLACES, first_points, from_points, scene_size, seen_colors
+from nerfloom.splats.start import PLACES, first_points, from_points, on_surfaces, scene_size, seen_colors
 from nerfloom.training.optim import learning_rate_factor
 
 NOISE, OPACITY_PENALTY, SCALE_PENALTY = 5e5, 0.002, 0.01
@@ -42,8 +42,6 @@ opacity penalty: theirs left too few Gaussians after a few hundred steps at a hi
 FIELD_SHARE, CLOSED_FIELD_SHARE = 0.2, 0.4
 """Maximum share of --max-seconds for training the field that Gaussians start from, and where every ray ends in the
 box."""
-FIELD_OPACITY, FIELD_SIZE = 0.5, 0.7
-"""Initial opacity of Gaussians on a field's surfaces, and their standard deviation in mean distances to neighbours."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +146,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
                 found = found_surfaces(field, dataset, self.config, self.config.field_steps, seconds, count)
             self.found_distances.set(found.images, found.pixels, found.distances)
             kept = ~self.in_the_way(found.positions)
-            places, colors = found.positions[kept], found.colors[kept]
-            first = from_points(places, colors, self.config.degree, FIELD_OPACITY, FIELD_SIZE)
+            first = on_surfaces(found.positions[kept], found.colors[kept], self.config.degree)
             if not len(first):
                 say("warning: the field has no surfaces; Gaussians start anywhere in the box")
                 kind = "random"

@@ -164,9 +164,6 @@ def way_between(seconds: float, first: float, last: float) -> float:
 def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, list[Decision]]:
     """Fill in the settings that depend on the time budget and the scene.
 
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-
     Raises:
         ConfigError: if colours are to depend on reflected directions and not on the viewing direction.
     """

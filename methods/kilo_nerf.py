@@ -130,11 +130,7 @@ class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
 
 
 def decide(config: KiloNeRFConfig, scene: Scene) -> tuple[KiloNeRFConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene."""
     config, made = decide_sampler(config, scene)
     config, samples = decide_samples(config, SAMPLES)
     return config, made + samples

@@ -171,11 +171,7 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion, plain=True):
 
 
 def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene."""
     scales = 1  # grows until a plane has at least a vertex per pixel
     while scales < MAX_SCALES and config.base_resolution << (scales - 1) < scene.image_size:
         scales += 1

@@ -61,11 +61,7 @@ class MipNeRF(RayModel[MipNeRFConfig], plain=True):
 
 
 def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene."""
     config, made = decide_sampler(config, scene)
     config, samples = decide_samples(config, OCCUPANCY_SAMPLES_PER_BATCH)
     return config, made + samples

@@ -121,11 +121,7 @@ class MipNeRF360(RefinedModel[MipNeRF360Config], plain=True):
 
 
 def decide(config: MipNeRF360Config, scene: Scene) -> tuple[MipNeRF360Config, list[Decision]]:
-    """Fill in the settings that depend on the scene and on the machine.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene and on the machine."""
     encoding, reason = "integrated", "a GPU runs the paper's networks"
     if device_kind(config.machine) == "cpu":
         encoding, reason = "hash-grid", "the paper's networks take days on a processor (else: --encoding integrated)"

@@ -56,11 +56,7 @@ class MovingGaussiansConfig(GaussianSplattingConfig, noise=0.0, opacity_penalty=
 
 
 def decide(config: MovingGaussiansConfig, scene: Scene) -> tuple[MovingGaussiansConfig, list[Decision]]:
-    """Fill in the settings that depend on the budget and the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the budget and the scene."""
     shortest = max(0.5 / (scene.num_times or scene.num_cameras), DURATIONS[0])
     made: list[Decision] = []
     if scene.moving:

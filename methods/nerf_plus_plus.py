@@ -38,11 +38,7 @@ class NeRFPlusPlusConfig(GridsConfig, VanillaNeRFConfig, num_rays_per_batch=1_02
 
 
 def decide(config: NeRFPlusPlusConfig, scene: Scene) -> tuple[NeRFPlusPlusConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene, with a sphere if there may be something outside its box.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene, with a sphere if there may be something outside its box."""
     grids = config.encoding == "hash-grid"
     config, made = decide_background(config, scene, "sphere", bounded="occupancy" if grids else None)
     config, few = decide_few_images(config, scene, OPEN_UNTIL)

@@ -12,14 +12,12 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-import torch
 from torch import Tensor
 
-from nerfloom import ConfigError, Decision, Method, Picture, Sampler, Scene, View
+from nerfloom import Decision, Method, Picture, Sampler, Scene, View
 from nerfloom.base.config import AT_LEAST_0, Range, VectorConfig
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
-from nerfloom.data.dataset import Dataset
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
 from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
@@ -63,7 +61,6 @@ class NerfWConfig(
 
     RANGES: ClassVar[dict[str, Range]] = {
         "transient_embedding_dim": (1, 2**10),
-        "transient_resolution": (1, 2**8),
         "least_uncertainty": (1e-4, 1e4),
         "transient_density_mult": AT_LEAST_0,
     }
@@ -71,9 +68,7 @@ class NerfWConfig(
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the paper's networks, of 8 layers of 256 features."""
     transient_embedding_dim: int = 16
-    """Length of an image's transient vectors."""
-    transient_resolution: int = 1
-    """Transient vectors along each side of an image, with interpolation. 1: one per image, as in the paper."""
+    """Length of an image's transient vector."""
     least_uncertainty: float = 0.1
     """Standard deviation of colours where nothing is transient; 0.03 in the paper."""
     transient_density_mult: float = 0.01
@@ -118,28 +113,9 @@ class NerfW(RefinedModel[NerfWConfig], plain=True):
         with lit, self.renderer.head.shown(view.image):
             return super().render_view(view, background)
 
-    def start(self, dataset: Dataset) -> None:
-        """Lay the maps of transient vectors over the images.
-
-        Args:
-            dataset: the training images.
-        """
-        cameras = dataset.cameras
-        half = torch.maximum(cameras.widths / cameras.fx, cameras.heights / cameras.fy) / 2
-        self.renderer.head.reach.fill_(float(half.max()))
-
 
 def decide(config: NerfWConfig, scene: Scene) -> tuple[NerfWConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-
-    Raises:
-        ConfigError: if an image has a map of vectors in normalised device coordinates.
-    """
-    if scene.warped and config.transient_resolution > 1:
-        raise ConfigError("--transient-resolution: maps do not work in normalised device coordinates; use 1")
+    """Fill in the settings that depend on the scene."""
     config, scaled = fill(config, Choice("gradient_scaling", True, "things near one camera may be in its image alone"))
     config, made = decide_capture(config, scene)
     config, samples = decide_samples(config, SAMPLES)
@@ -166,9 +142,8 @@ def sampler(config: NerfWConfig, scene: Scene) -> Sampler:
 def renderer(config: NerfWConfig, scene: Scene) -> TransientRenderer:
     """Return the renderer, with the transient head."""
     features, width = (PAPER_WIDTH, PAPER_WIDTH // 2) if config.encoding == "frequency" else (NUM_FEATURES, GRID_WIDTH)
-    known, sizes = scene.camera_to_worlds, (config.transient_embedding_dim, config.transient_resolution, width)
-    poses = torch.eye(3, 4).repeat(scene.num_cameras, 1, 1) if known is None else known
-    head = TransientHead(features, *sizes, scene.box, poses, START / half_edge(scene.box))
+    sizes = features, scene.num_cameras, config.transient_embedding_dim, width
+    head = TransientHead(*sizes, scene.box, START / half_edge(scene.box))
     made = TransientRenderer(head, config.least_uncertainty, scaled_up_to(config, scene), config.thin_gradients)
     made.optimised = _optimised(config)
     return made

@@ -137,9 +137,6 @@ class Nerfacto(RefinedModel[NerfactoConfig], plain=True):
 def decide(config: NerfactoConfig, scene: Scene) -> tuple[NerfactoConfig, list[Decision]]:
     """Fill in the settings that depend on the scene.
 
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-
     Raises:
         ConfigError: if normals are to be predicted twice.
     """

@@ -97,11 +97,7 @@ class RefNeRF(RayModel[RefNeRFConfig], plain=True):
 
 
 def decide(config: RefNeRFConfig, scene: Scene) -> tuple[RefNeRFConfig, list[Decision]]:
-    """Fill in the settings that depend on the encoding and the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the encoding and the scene."""
     on_grid = config.encoding == "hash-grid"
     reason = "there may be something outside the box" if scene.unbounded else f"--encoding is {config.encoding}"
     bounded = "occupancy" if on_grid else "hierarchical"

@@ -190,11 +190,7 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
 
 
 def decide(config: TensoRFConfig, scene: Scene) -> tuple[TensoRFConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene and on the resolution of the images.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene and on the resolution of the images."""
     density, appearance = (16, 48) if config.decomposition == "vm" else (96, 288)
     resolved = VERTICES_PER_PIXEL * scene.image_size
     first, last = (min(side, resolved) for side in (FIRST_SIDE, LAST_SIDE[config.decomposition]))

@@ -69,11 +69,7 @@ class VanillaNeRFConfig(
 
 
 def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, list[Decision]]:
-    """Fill in the settings that depend on the scene.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the settings that depend on the scene."""
     config, made = decide_background(config, scene)
     config, few = decide_few_images(config, scene, OPEN_UNTIL)
     config, samples = decide_samples(config, OCCUPANCY_SAMPLES_PER_BATCH)

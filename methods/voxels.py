@@ -94,15 +94,7 @@ class VoxelsConfig(
 
 
 def decide(config: VoxelsConfig, scene: Scene) -> tuple[VoxelsConfig, list[Decision]]:
-    """Fill in the resolution.
-
-    Args:
-        config: the method's settings.
-        scene: properties of the data.
-
-    Returns:
-        Settings without open ones, and a record of each setting that was filled in.
-    """
+    """Fill in the resolution."""
     cells = min(max(round(CELLS_PER_PIXEL * scene.image_size), MIN_CELLS), MAX_CELLS)
     reason = f"the images have {scene.image_size} pixels along a side"
     if config.max_seconds is not None:

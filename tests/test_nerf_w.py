@@ -1,4 +1,4 @@
-"""NeRF-W: its loss, compositing of two parts, held-out views, and the positions of transient vectors."""
+"""NeRF-W: its loss, compositing of two parts, held-out views, and transient vectors."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom import ConfigError, Field, Points, Rays, Samples
+from nerfloom import Field, Points, Rays, Samples
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
 from nerfloom.losses.functions import doubted_error
@@ -15,7 +15,6 @@ from nerfloom.methods.nerf_w import START
 from nerfloom.rendering.transient import TransientRenderer
 from nerfloom.samplers.proposal import half_edge
 from nerfloom.testing import assert_method
-from nerfloom.testing.ball import cameras_at
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.optim import make_optimizer
 from tests.training.helpers import TINY
@@ -68,7 +67,7 @@ class Given(TransientHead):
     """A transient part of given values, the same in every image."""
 
     def __init__(self, density: Tensor, color: Tensor, doubt: Tensor) -> None:
-        super().__init__(3, 2, 1, 8, BOX, torch.eye(3, 4).repeat(4, 1, 1), 0.1)
+        super().__init__(3, 4, 2, 8, BOX, 0.1)
         self.given = density, color, doubt
 
     def forward(self, features: Tensor, positions: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -135,7 +134,7 @@ def test_rays_of_no_training_image_show_the_static_part() -> None:
 def test_before_training_the_transient_part_is_nearly_transparent() -> None:
     box = torch.tensor([[-3.0] * 3, [3.0] * 3])
     torch.manual_seed(0)
-    head = TransientHead(16, 16, 1, 64, box, torch.eye(3, 4).repeat(5, 1, 1), START / half_edge(box))
+    head = TransientHead(16, 5, 16, 64, box, START / half_edge(box))
     positions = 6 * torch.rand(1000, 3) - 3
     density, color, doubt = head(torch.randn(1000, 16), positions, torch.randn(1000, 16))
     assert density.shape == doubt.shape == (1000,)
@@ -146,34 +145,14 @@ def test_before_training_the_transient_part_is_nearly_transparent() -> None:
     assert not torch.equal(other[1], head(torch.zeros(1, 16), torch.zeros(1, 3), torch.zeros(1, 16))[1])
 
 
-@pytest.mark.parametrize("resolution", [1, 2, 5])
-def test_vectors_are_interpolated_over_each_image(resolution: int) -> None:
-    """Each image's vectors are linear over it, so a look-up gives this function of the pixel's place."""
-    cameras = cameras_at(torch.tensor([[4.0, 0, 1], [0.0, 4, 1], [-3.0, 1, 2]]), 40, 9)
-    head = TransientHead(16, 3, resolution, 8, BOX, cameras.camera_to_worlds, 0.1)
-    head.reach.fill_(float((cameras.widths / cameras.fx).max()) / 2)
-    place = torch.linspace(-1, 1, resolution) if resolution > 1 else torch.zeros(1)
-    row, column = torch.meshgrid(place, place, indexing="ij")
+def test_each_image_has_its_own_vector() -> None:
+    head = TransientHead(16, 3, 2, 8, BOX, 0.1)
     with torch.no_grad():
-        maps = torch.stack([torch.stack([column, row, torch.full_like(row, i)], -1) for i in range(3)])
-        head.vectors.copy_(maps.view(-1, 3))
-    for index in range(3):
-        rays = cameras.pixel_rays(cameras.image_pixels(index).flatten(), 1.0, 9.0)
-        found = head.vectors_of(rays)
-        assert found is not None
-        across = (torch.arange(9) + 0.5) / 4.5 - 1
-        down, along = torch.meshgrid(-across, across, indexing="ij")  # the camera's y axis points up
-        linear = torch.stack([along, down], -1).view(-1, 2) if resolution > 1 else torch.zeros(81, 2)
-        torch.testing.assert_close(found[:, :2], linear, atol=1e-5, rtol=0)
-        torch.testing.assert_close(found[:, 2], torch.full((81,), float(index)), atol=1e-5, rtol=0)
-
-
-def test_maps_are_refused_where_directions_are_not_those_of_cameras() -> None:
-    scene = dataclasses.replace(ball_in_a_box().scene, warped=True)
-    config = nerf_w.METHOD.config
-    nerf_w.METHOD.decided(config, scene)
-    with pytest.raises(ConfigError, match="--transient-resolution"):
-        nerf_w.METHOD.decided(dataclasses.replace(config, transient_resolution=2), scene)
+        head.vectors.copy_(torch.arange(6.0).view(3, 2))
+    rays = Rays(torch.zeros(4, 3), torch.tensor([[0.0, 0, 1]]).repeat(4, 1), camera_indices=torch.tensor([2, 0, 1, 2]))
+    found = head.vectors_of(rays)
+    assert found is not None
+    assert found.tolist() == [[4, 5], [0, 1], [2, 3], [4, 5]]
 
 
 @pytest.mark.parametrize(("encoding", "rate"), [("frequency", 5e-4), ("hash-grid", 1e-2)])

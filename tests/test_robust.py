@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from nerfloom.base.errors import ConfigError
 from nerfloom.base.plain import from_plain
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import PixelBatch
@@ -70,7 +69,7 @@ def learnt(count: int, steps: int, person: float, noise: float) -> tuple[Contrad
     """Tiles after random draws with errors of any sign, and a person in a corner of the first image, with errors of one
     sign. Returns the tiles and the pixels (P,) bool of the person."""
     torch.manual_seed(count)
-    tiles, cameras = ContradictedTiles(BALL.train, 4.0), BALL.train.cameras
+    tiles, cameras = ContradictedTiles(BALL.train), BALL.train.cameras
     total, width = int(cameras.offsets[-1]), int(cameras.widths[0])
     pixels = torch.arange(total)
     side = 3 * tiles.tiles.side
@@ -102,7 +101,7 @@ def test_hardly_a_tile_is_left_out_where_nothing_moves(count: int) -> None:
 
 def test_means_forget_as_stated_and_pass_over_what_is_not_finite() -> None:
     """The truth is in float64, with one pixel a step."""
-    tiles = ContradictedTiles(BALL.train, 4.0)
+    tiles = ContradictedTiles(BALL.train)
     sums, weight, kept = np.zeros(3), 0.0, np.exp(-1 / MEMORY)
     for step in range(100):
         errors = torch.tensor([[0.01 * step, -0.2, 0.3]])
@@ -121,7 +120,7 @@ def test_all_pixels_count_at_first_and_without_draws() -> None:
     assert float(tiles.share) == 0
     tiles.decide(ALL_UNTIL)
     assert float(tiles.counting(there.nonzero()[:, 0]).mean()) < 0.2
-    few = ContradictedTiles(BALL.train, 4.0)
+    few = ContradictedTiles(BALL.train)
     few.learn(torch.arange(MIN_DRAWS - 1), torch.ones(MIN_DRAWS - 1, 3))
     few.decide(1.0)
     assert float(few.share) == 0
@@ -204,12 +203,6 @@ def test_a_resumed_source_decides_the_same() -> None:
     assert 0 < float(other.contradicted.share) < 0.5
 
 
-def test_a_factor_below_one_is_refused() -> None:
-    config = load_method("instant-ngp").config
-    with pytest.raises(ConfigError, match="--robust-factor is 0; it must be from 1"):
-        dataclasses.replace(config, robust_factor=0)
-
-
 def test_a_weighted_loss_against_its_definition() -> None:
     prediction, target, weights = torch.rand(5, 3), torch.rand(5, 3), torch.rand(5)
     by_hand = sum(weights[i].item() * (prediction[i, c] - target[i, c]).item() ** 2 for i in range(5) for c in range(3))
@@ -248,7 +241,7 @@ def test_scores_of_a_whole_image_in_float64(height: int, width: int, side: int) 
 
 def test_a_whole_image_shows_who_is_there_and_its_weights_fall_with_time() -> None:
     torch.manual_seed(0)
-    views, side = ContradictedViews(BALL.train, 2.0), ContradictedViews(BALL.train, 2.0).tiles.side
+    views, side = ContradictedViews(BALL.train), ContradictedViews(BALL.train).tiles.side
     there = torch.zeros(24, 24, dtype=torch.bool)
     there[: 3 * side, : 3 * side] = True
     flat = torch.full((24, 24, 3), 0.5)
@@ -265,7 +258,7 @@ def test_a_whole_image_shows_who_is_there_and_its_weights_fall_with_time() -> No
 
 
 def test_before_a_quarter_of_the_budget_nothing_is_decided_from_a_whole_image() -> None:
-    views = ContradictedViews(BALL.train, 2.0)
+    views = ContradictedViews(BALL.train)
     views.learn_view(0, torch.ones(24, 24, 3), torch.zeros(24, 24, 3), 0.9 * ALL_UNTIL)
     assert float(views.share) == 0
 
@@ -278,7 +271,7 @@ def test_structure_that_is_not_sharp_yet_is_not_taken_for_people() -> None:
     chequered = ((rows + columns) % 2).float()[..., None].expand(-1, -1, 3)
     found = list[bool]()
     for colors in (torch.full((24, 24, 3), 0.5), chequered):
-        views = ContradictedViews(BALL.train, 2.0)
+        views = ContradictedViews(BALL.train)
         views.learn_view(0, errors, colors, 1.0)
         found.append(bool(views.tiles.of_image(views.state, 0)[0, 0]))
     assert found == [True, False]

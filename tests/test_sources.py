@@ -78,7 +78,7 @@ def test_a_source_is_made_as_the_model_asks(images: Dataset) -> None:
 
 
 def test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set(images: Dataset) -> None:
-    source = PixelSource(images, "black", 0, contradicted=ContradictedTiles(images, 2.0))
+    source = PixelSource(images, "black", 0, contradicted=ContradictedTiles(images))
     request = Request(0, 50)
     batch = source.draw(request)
     source.learn(request, batch, batch.rgb + 3)
@@ -89,7 +89,7 @@ def test_what_was_learnt_of_errors_goes_along_to_a_changed_data_set(images: Data
     changed = source.drawing_from(images.drawing(some))
     assert changed.state() is learnt
     assert bool((changed.draw(Request(1, 200)).pixels % 2 == 0).all())
-    other = PixelSource(images, "black", 0, contradicted=ContradictedTiles(images, 2.0))
+    other = PixelSource(images, "black", 0, contradicted=ContradictedTiles(images))
     other.restore(learnt)
     assert torch.equal(other.state(), learnt)
 

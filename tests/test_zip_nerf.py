@@ -217,7 +217,9 @@ def test_what_a_march_has_evaluated_is_not_evaluated_again(field: MultisampledFi
 
 
 @pytest.mark.medium
-def test_images_of_other_exposure_get_functions_of_their_own(shared_tiny: Path, tmp_path: Path) -> None:
+def test_images_of_other_exposure_get_functions_of_their_own(
+    shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each second image is darkened: its function darkens, and in the mean functions change little."""
     still: Dataset = tiny_trainer("zip-nerf", shared_tiny, tmp_path / "still").train_set
     dark = torch.arange(len(still)) % 2 == 0
@@ -226,7 +228,8 @@ def test_images_of_other_exposure_get_functions_of_their_own(shared_tiny: Path, 
     dimmed[:, :3] = (still.pixels[:, :3] * factors[:, None]).round().to(torch.uint8)
     varied = dataclasses.replace(still, pixels=dimmed, scene=dataclasses.replace(still.scene, appearance_varies=True))
     (tmp_path / "run").mkdir()
-    settings = {"max_eval_images": 0, "max_num_iterations": 70, "appearance_rate": 1e-2}
+    monkeypatch.setattr("nerfloom.rendering.light.RATE", 1e-2)
+    settings = {"max_eval_images": 0, "max_num_iterations": 70}
     trainer = Trainer.of(tiny_run("zip-nerf", shared_tiny, tmp_path / "run", **settings), varied)
     trainer.train()
     light = trainer.model.light.eval()

@@ -147,7 +147,7 @@ class TrainConfig:
 
     # Values of settings that a method lacks, so that shared code need not know the class of its settings. They have no
     # annotations, so they are neither fields nor flags.
-    sampler, bounded_sampler, time_slices, robust, robust_factor = "", "occupancy", 1, "off", 2.0
+    sampler, bounded_sampler, time_slices, robust = "", "occupancy", 1, "off"
     appearance = changing_light = "none"
     background_model, directional = "contraction", "view"
     learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = False
@@ -199,14 +199,9 @@ HeldOutAppearance = Literal["mean", "half", "nearest"]
 class RobustConfig(TrainConfig):
     """Settings of a method with a colour loss that uses the weights of pixels."""
 
-    RANGES: ClassVar[dict[str, Range]] = {"robust_factor": (1, 1e6)}
-    """Allowed ranges."""
     robust: Literal["off", "errors", "scout"] = "off"
     """How to leave out regions that other images contradict, such as people who walk through. errors: by errors in
     training. scout: by a field that is trained first, in a part of the budget; then they are masked out."""
-    robust_factor: float = 2.0
-    """A tile of an image is contradicted if the square of its mean error is this many times the median (--robust
-    errors)."""
 
 
 @dataclass(frozen=True)
@@ -216,15 +211,13 @@ class AppearanceConfig(TrainConfig):
     `changing_light` is the kind of appearance that `auto` chooses if light differs between the images.
     """
 
-    RANGES: ClassVar[dict[str, Range]] = {"appearance_rate": AT_LEAST_0, "mean_appearance_share": (0, 1)}
+    RANGES: ClassVar[dict[str, Range]] = {"mean_appearance_share": (0, 1)}
     """Allowed ranges."""
     appearance: Auto[AppearanceKind] = AUTO
     """How images differ. none: not at all; vector: by an input of the colour network; affine: by an affine function of
     colours; tone: by exposure and white balance, through a tone curve of each camera; grid: by affine functions that
     vary with position and brightness. auto: vector or affine if light or exposure differ and the method has it by
     default, else none."""
-    appearance_rate: float = 1e-3
-    """Initial learning rate of affine functions, exposures, tone curves and grids."""
     eval_appearance: HeldOutAppearance = "mean"
     """Appearance of held-out images. mean: the mean of the training images'; half: optimised on the left half of each
     image, with metrics of the right half (NeRF-W's protocol); nearest: the training image's with the nearest camera."""

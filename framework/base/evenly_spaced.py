@@ -30,3 +30,10 @@ def evenly_spread(total: int, count: int) -> list[int]:
     if count >= total:
         return list(range(total))
     return [round(Fraction(rank * (total - 1), max(count - 1, 1))) for rank in range(count)]
+
+
+def strided(total: int, limit: int | None) -> list[int]:
+    """Return at most `limit` of the numbers 0 to `total` - 1, evenly spaced from 0 on; all if `limit` is None."""
+    if limit is None or limit >= total:
+        return list(range(total))
+    return [index * total // limit for index in range(limit)]

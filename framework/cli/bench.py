@@ -14,6 +14,7 @@ from nerfloom.cli.bench_flags import FramesFlags, KernelFlags, MethodFlags, Prof
 from nerfloom.cli.bench_gpu import GpuFlags, measure_gpu
 from nerfloom.cli.bench_results import run_benchmark, write_results
 from nerfloom.cli.common import make_room, run_command
+from nerfloom.training.run_path import data_name
 
 USAGE = """\
 usage: ns-bench WHAT [flags]
@@ -65,7 +66,7 @@ def _methods(flags: MethodFlags) -> None:
     from nerfloom.benchmarks.methods import draw, published, standard_plan
     from nerfloom.cli.compare import compare
 
-    name = "procedural" if flags.data is None else flags.data.resolve().name
+    name = data_name(flags.data)
     folder = flags.run_dir or Path("outputs") / f"bench-{name}"
     rows = compare(standard_plan(flags.data, flags.max_seconds, flags.repeats, folder))
     write_results(flags.output_dir / f"methods-{name}.json", published(folder))

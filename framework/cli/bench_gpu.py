@@ -10,6 +10,7 @@ from pathlib import Path
 from nerfloom.base.errors import ConfigError
 from nerfloom.cli.bench_results import RESULTS, write_results
 from nerfloom.cli.common import make_room
+from nerfloom.training.run_path import data_name
 
 SETUP_SECONDS, STEPS_SECONDS = 30.0, 60.0
 """Expected seconds of a method's start and evaluation, and of the timed steps."""
@@ -61,7 +62,7 @@ def measure_gpu(flags: GpuFlags) -> None:
     from nerfloom.benchmarks.gpu import METHODS, Part, gpu_plan, in_time, measured_kernels, reached, timed_steps
     from nerfloom.cli.compare import compare
 
-    name = "procedural" if flags.data is None else flags.data.resolve().name
+    name = data_name(flags.data)
     path = flags.output_dir / f"gpu-{name}.json"
     make_room(path)
     device = torch.device("cuda")

@@ -12,7 +12,7 @@ from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import run_command
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.job_flags import JobFlags
-from nerfloom.training.run_path import check_data, check_writable
+from nerfloom.training.run_path import check_data, check_writable, data_name
 
 if TYPE_CHECKING:
     from nerfloom.blocks.block import Block, TrainedBlock
@@ -88,7 +88,7 @@ def _command(arguments: list[str]) -> None:
     flags.check()
     if flags.data is not None:
         check_data(flags.data)
-    name = "procedural" if flags.data is None else flags.data.resolve().name
+    name = data_name(flags.data)
     folder = (flags.output_dir or Path("outputs") / f"blocks-{name}").absolute()
     check_writable(folder, "the runs to")
     from nerfloom.cli.train import run_of

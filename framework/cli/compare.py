@@ -12,7 +12,7 @@ from nerfloom.cli.common import check_weights, run_command, take
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.geometry_flags import GeometryFlags
 from nerfloom.cli.job_flags import JobFlags
-from nerfloom.training.run_path import check_data, check_writable
+from nerfloom.training.run_path import check_data, check_writable, data_name
 
 if TYPE_CHECKING:
     from nerfloom.comparison.measures import Row
@@ -97,7 +97,7 @@ def plan_of(flags: CompareFlags) -> Plan:
         lpips_weights=None if flags.lpips_weights is None else str(flags.lpips_weights.resolve()),
         geometry=() if flags.reference is None else flags.words(),
     )
-    name = "procedural" if flags.data is None else flags.data.resolve().name
+    name = data_name(flags.data)
     folder = flags.output_dir or Path("outputs") / f"compare-{name}"
     return Plan(tuple(Contender.of(text) for text in flags.methods), conditions, flags.repeats, folder.resolve())
 

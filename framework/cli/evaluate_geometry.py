@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +52,7 @@ def evaluate_geometry(
     """
     start = time.monotonic()
     kind = kind_for(loaded.model) if flags.surface == "auto" else flags.surface
-    surface = _made(flags, loaded, reference, kind) if mesh is None else read_mesh(mesh).without_normals()
+    surface = _made(flags, loaded, reference, kind) if mesh is None else replace(read_mesh(mesh), normals=None)
     source = kind if mesh is None else str(mesh)
     views = None if flags.min_views == 0 else _views(loaded, flags.min_views)
     found = judge_surface(surface, reference, views, flags.f_score_at, flags.crop)

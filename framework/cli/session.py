@@ -18,10 +18,11 @@ from nerfloom.base.extras import install_command
 from nerfloom.base.processes import from_first, joined_processes, processes
 from nerfloom.base.signals import Stopped, handled, signal_of
 from nerfloom.cli.common import check_weights
-from nerfloom.cli.next_steps import after_training
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.device_placement import on_device
+from nerfloom.data.scene import Scene
 from nerfloom.evaluation.evaluator import evaluate
+from nerfloom.evaluation.video_suffixes import default_video
 from nerfloom.model import StartsFromImages
 from nerfloom.renderable import with_refined_poses
 from nerfloom.splats.gaussians import HasGaussians
@@ -213,6 +214,20 @@ def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:
         folder, seen = run.folder / "pictures" / "training", with_refined_poses(trainer.model, trainer.train_set)
         evaluate(trainer.model, seen, max_images=MAX_TRAINING, pictures=folder, title="Training images")
         say(f"pictures of training images, with what only one image contains: {folder}")
+
+
+def after_training(scene: Scene, folder: Path) -> list[str]:
+    """Return lines with commands: look at the run in `folder`, film its `scene` along a fitting path, and judge it."""
+    run = shlex.quote(str(folder))
+    path = "spiral" if scene.warped else "interpolate" if scene.unbounded else "orbit"
+    lines = ["next:"]
+    if scene.num_scenes == 1:
+        lines.append(f"  look at it in a browser:  ns-viewer {run}")
+        lines.append(f"  make a video:             ns-render {path} {run} --output-path {default_video(path)}")
+    if scene.num_scenes == 1 and not scene.warped:
+        lines.append(f"  make a web page of it:    ns-export web {run} --output-dir exports")
+    lines.append(f"  evaluate it again:        ns-eval {run}")
+    return lines
 
 
 def _viewer(run: Run, trainer: Trainer) -> AbstractContextManager[BetweenSteps | None]:

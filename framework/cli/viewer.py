@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.base.extras import install_command
+from nerfloom.base.errors import FlagError
 from nerfloom.base.machine_config import ViewerConfig
 from nerfloom.cli.common import run_command, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.run_flags import OPENS, RunFlags
 from nerfloom.training.run_path import trained_run
+from nerfloom.viewer.server import check_installed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +40,7 @@ def _command(arguments: list[str]) -> None:
     flags = read_flags(ViewerFlags, "ns-viewer", words, takes=f"{OPENS} [{OPENS}]")
     if flags.beside is not None and flags.while_moving is not None:
         raise FlagError(f"--while-moving {flags.while_moving}: runs side by side have no faster file; leave one out")
-    if (command := install_command("viewer")) is not None:
-        raise ConfigError(f"the viewer needs viser: {command}")
+    check_installed()
     other = None if flags.beside is None else replace(flags, load_config=flags.beside, load_checkpoint=None)
     found, second = flags.check(), None if other is None else other.check()
     file = None if flags.while_moving is None else trained_run(flags.while_moving, None, None)

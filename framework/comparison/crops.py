@@ -11,6 +11,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.evaluation.images import error_map
 from nerfloom.evaluation.view_files import WORST
 
@@ -64,9 +65,8 @@ def views(folders: Sequence[tuple[str, Path]], count: int = MAX_VIEWS) -> list[V
         {file.name.removesuffix(IMAGE_SUFFIX) for file in folder.glob("*" + IMAGE_SUFFIX)} for _, folder in folders
     ]
     shared = sorted(set.intersection(*names) - {WORST}) if names else []  # the worst view differs between contenders
-    count = min(count, len(shared))
-    chosen = [shared[index * len(shared) // count] for index in range(count)]
-    return [view for view in (_view(name, folders) for name in chosen) if view is not None]
+    chosen = (_view(shared[index], folders) for index in strided(len(shared), count))
+    return [view for view in chosen if view is not None]
 
 
 def _view(name: str, folders: Sequence[tuple[str, Path]]) -> View | None:

@@ -268,5 +268,5 @@ def _contradicted(kind: str, dataset: Dataset, config: TrainConfig) -> LeftOutTi
     if config.robust == "scout":
         return LeftOutTiles(dataset, SCOUTED_ALONG)
     if kind == "views":
-        return ContradictedViews(dataset, config.robust_factor)
-    return ContradictedTiles(dataset, config.robust_factor)
+        return ContradictedViews(dataset)
+    return ContradictedTiles(dataset)

@@ -8,12 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.poses import Placement, rotation_between
 from nerfloom.cameras.scale import Scale
 from nerfloom.edit.similarity import Similarity
-from nerfloom.export.run_page import moment_of
+from nerfloom.export.run_gaussians import finite, moment_of
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.splats.placed_files import in_input, write_placed
@@ -59,14 +58,10 @@ class Edited:
             raise ConfigError(
                 f"{loaded.origin}: {loaded.method} has no Gaussians to edit; ns-train gaussian-splatting makes them"
             )
-        if loaded.model.scene.warped:
+        if model.scene.warped:
             raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to edit in")
-        found = model.gaussians(moment_of(loaded.model.scene.moving, time)).map(lambda values: values.detach().cpu())
-        good = found[found.finite()]
-        if len(good) < len(found):
-            say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
-        if not len(good):
-            raise ConfigError(f"{loaded.origin} has no Gaussians left; train it again")
+        found = model.gaussians(moment_of(model.scene.moving, time))
+        good = finite(found, f"{loaded.origin} has no Gaussians left; train it again")
         return cls(in_input(good, loaded.placement), model.look(), loaded.scale, loaded.placement, loaded)
 
     def __len__(self) -> int:

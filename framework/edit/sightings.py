@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import track
-from nerfloom.evaluation.evaluator import spread
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.kernels.splats.project import Record, SplatCamera
 from nerfloom.splats.drawing import smallest_depth, splat_camera
 from nerfloom.splats.gaussians import Gaussians
@@ -55,7 +55,7 @@ def training_views(loaded: Loaded, look: Look, most: int = MAX_VIEWS) -> list[Sp
     scene, parsed = loaded.model.scene, loaded.parsed("train")
     cameras = parsed.cameras.scaled(1 / parsed.downscale_factor).to(loaded.model.device)
     found = []
-    for index in spread(len(cameras), most):
+    for index in strided(len(cameras), most):
         reduced = -(-max(cameras.sizes[index]) // MAX_SIDE)
         found.append(splat_camera(cameras[index : index + 1], smallest_depth(scene), look, reduced=reduced))
     return found

@@ -7,8 +7,9 @@ from contextlib import contextmanager
 
 from nerfloom.base.console import track
 from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import spread, timed_view
+from nerfloom.evaluation.evaluator import timed_view
 from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import StopsEarly
 
@@ -63,7 +64,7 @@ def measured_error(model: Renderable, dataset: Dataset, bound: float) -> tuple[f
         The maximum difference of a colour channel from rendering without early stop, and the ratio of the two times.
     """
     background, worst, times = model.background, 0.0, [0.0, 0.0]
-    chosen = spread(len(dataset), MAX_VIEWS)
+    chosen = strided(len(dataset), MAX_VIEWS)
     for index in track(chosen, "Measuring the error", total=len(chosen)):
         views = []
         for number, stop in enumerate((0.0, bound)):

@@ -18,6 +18,7 @@ from nerfloom.base.config import HeldOutAppearance
 from nerfloom.base.console import say, track
 from nerfloom.base.device import runs_ahead, wait_for
 from nerfloom.base.errors import DataError
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.base.meter import time_text
 from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
@@ -234,7 +235,7 @@ def evaluate(
     appearance = model.appearance
     half = appearance is not None and appearance.held_out == "half"
     views = views_to_judge(dataset, half)
-    asked = [views[rank] for rank in spread(len(views), max_images)]
+    asked = [views[rank] for rank in strided(len(views), max_images)]
     if not asked:
         raise DataError(f"there are no images to evaluate: masks cover all {len(dataset)} of them")
     if isinstance(model, RendersFromImages) and dataset.source_images is not None:
@@ -246,7 +247,7 @@ def evaluate(
         judge(asked[0])  # compiles kernels, so that the other views need not wait
     first, cost = _timed(partial(judge, asked[0]), f"{title}: the first image")
     chosen = _in_time(asked, cost, seconds)
-    shown = {chosen[rank] for rank in spread(len(chosen), max_pictures)}
+    shown = {chosen[rank] for rank in strided(len(chosen), max_pictures)}
     files = ViewFiles(pictures, dataset.names, shown, with_worst=0 < len(shown) < len(chosen))
     order = sorted(chosen, key=lambda index: index not in shown)
     others = ((index, judge(index)) for index in track(order[1:], title, len(order), done=1, spent=cost))
@@ -279,7 +280,7 @@ def _timed(work: Callable[[], T], title: str) -> tuple[T, float]:
 
 def _in_time(views: list[int], cost: float, seconds: float | None) -> list[int]:
     """Return as many views, evenly spaced, as fit into a time limit at `cost` seconds each; all without a limit."""
-    chosen = views if seconds is None else [views[rank] for rank in spread(len(views), max(int(seconds / cost), 1))]
+    chosen = views if seconds is None else [views[rank] for rank in strided(len(views), max(int(seconds / cost), 1))]
     if len(chosen) < len(views):
         say(f"evaluating {len(chosen)} of {len(views)} images, {time_text(cost)} each (all: --eval all, or ns-eval)")
     return chosen
@@ -329,13 +330,6 @@ def _has_kept_pixels(dataset: Dataset, index: int, half: bool) -> bool:
     """Return whether masks keep any pixel of an image, or of its right half."""
     kept = dataset.kept_of(index)
     return kept is None or bool((right_half(kept) if half else kept).any())
-
-
-def spread(total: int, limit: int | None) -> list[int]:
-    """Return at most `limit` of the numbers 0 to `total` - 1, evenly spaced; all if `limit` is None."""
-    if limit is None or limit >= total:
-        return list(range(total))
-    return [index * total // limit for index in range(limit)]
 
 
 def _row(dataset: Dataset, index: int, measured: Measured, seconds: float) -> dict[str, Any]:

@@ -48,10 +48,6 @@ class Surface:
         used = self.points if self.faces is None else self.points[self.faces.reshape(-1)]
         return float((used.amax(0) - used.amin(0)).max())
 
-    def without_normals(self) -> Surface:
-        """Return the surface without normals of its points."""
-        return replace(self, normals=None)
-
     def describe(self) -> str:
         """Return a description of its size, as text."""
         if self.faces is None:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfloom.base.console import say, track
+from nerfloom.base.console import say
 from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
@@ -31,6 +31,7 @@ from nerfloom.octrees.packing import packed
 from nerfloom.ray_model import RayModel
 from nerfloom.renderable import RendersFromImages
 from nerfloom.training.loaded import Loaded
+from nerfloom.training.progress import take_all
 from nerfloom.training.trainer import Trainer
 
 METHOD = Method(OctreeConfig(), paper="arXiv:2103.14024", model=OctreeModel, name="octree")
@@ -187,12 +188,8 @@ def learnt(
     model = trainer.model
     assert isinstance(model, OctreeModel)
     model.set_octree(layout, raw, coefficients)
-    steps, start = trainer.steps(), time.perf_counter()
-    for percent in track(range(100), "Learning from photographs", total=100):
-        for report in steps:
-            if report.progress >= (percent + 1) / 100:
-                break
-    state = trainer.state
+    start, state = time.perf_counter(), trainer.state
+    take_all(trainer.steps(), "Learning from photographs")
     say(
         f"{state.step:,} steps on photographs in {time.perf_counter() - start:.0f} s: {state.train_psnr:.2f} dB on them"
     )

@@ -132,7 +132,7 @@ def _cameras() -> Writer:
 
 
 def _occupancy() -> Writer:
-    from nerfloom.export.run_occupancy import export_occupancy
+    from nerfloom.export.occupancy import export_occupancy
 
     return lambda loaded, path, settings, _: export_occupancy(loaded, path, settings)
 

@@ -10,14 +10,42 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
+from nerfloom.base.console import say
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.extras import require
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.ply import write_points
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import write_mesh
+from nerfloom.export.settings import OccupancySettings
+from nerfloom.renderable import parts
 from nerfloom.samplers.base import SkipsCells
+from nerfloom.training.loaded import Loaded
 
 GREY = 0.6
 """Colour of cells."""
+
+
+def export_occupancy(loaded: Loaded, path: Path, settings: OccupancySettings) -> None:
+    """Write the occupancy grid of `loaded` to `path`, .npz, and its cells as PLY beside it, by `settings`.
+
+    Raises:
+        ConfigError: if the run has no grid, no cell is occupied, or packages are missing.
+    """
+    grids = parts(loaded.model, SkipsCells)
+    if not grids:
+        raise ConfigError(f"ns-export occupancy: this run of {loaded.method} has no occupancy grid")
+    if settings.cells == "boxes":
+        require("export", "--cells boxes needs", "; or take --cells centers")
+    grid = grids[0]
+    count = int(innermost(grid).sum())
+    write_grid(path, grid, loaded.placement)
+    say(f"{grid.resolution}^3 cells, {count:,} occupied: {path}")
+    if not count:
+        raise ConfigError("no cell is occupied, so that there is nothing to write to occupancy.ply")
+    cells = path.with_suffix(".ply")
+    write_cells(cells, grid, loaded.placement, settings.cells == "boxes")
+    say(f"{count:,} cells: {cells}")
 
 
 def box_frame(grid: SkipsCells, placement: Placement) -> Tensor:

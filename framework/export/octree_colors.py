@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import track
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.fields.base import Field
@@ -66,7 +67,7 @@ def seen_leaves(layout: OctreeLayout, raw: Tensor, cameras: Cameras, near: float
         near, far: distances where rays start and end.
     """
     count, largest = len(cameras), torch.zeros(layout.num_leaves)
-    chosen = [index * count // min(count, MAX_VIEWS) for index in range(min(count, MAX_VIEWS))]
+    chosen = strided(count, MAX_VIEWS)
     by_view = torch.zeros(layout.num_leaves, len(chosen), dtype=torch.uint8)
     sets = []
     for index in track(range(count), "Looking at leaves", total=count):

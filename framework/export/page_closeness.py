@@ -8,11 +8,12 @@ from statistics import fmean
 import torch
 
 from nerfloom.base.console import track
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.evaluator import measure, spread, views_to_judge
+from nerfloom.evaluation.evaluator import measure, views_to_judge
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.export.page_scenes import ScenePage
 from nerfloom.export.web import pinhole
@@ -58,7 +59,7 @@ def closeness(
     """
     background = model.background
     judged = (views_to_judge(dataset) if dataset else []) or list(range(len(cameras)))
-    chosen = [judged[rank] for rank in spread(len(judged), MAX_VIEWS)]
+    chosen = [judged[rank] for rank in strided(len(judged), MAX_VIEWS)]
     as_seen = cameras.model in page.lenses
     cameras = cameras if as_seen else pinhole(cameras)
     own: list[float] = []

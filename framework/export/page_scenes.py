@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
 from nerfloom.export.octree_page import make_octree_page
+from nerfloom.export.run_gaussians import finite
 from nerfloom.export.web import PageFacts, gaussians_of, make_page
 from nerfloom.geometry.lenses import LENSES
 from nerfloom.geometry.regions import Region, inside_all
@@ -54,7 +54,7 @@ def gaussian_page(
 
     Args:
         loaded: the run or file.
-        gaussians: Gaussians in the scene's frame. All that are not finite are dropped and counted.
+        gaussians: Gaussians in the scene's frame. All that are not finite are left out and counted.
         look: how they are drawn.
         facts: further data of the page.
         turn: (3, 3) rotation from the scene's frame to the page's.
@@ -65,7 +65,7 @@ def gaussian_page(
         ConfigError: if there is nothing to show, or nothing fits.
     """
     model, still = loaded.model, torch.zeros(3)
-    good = _finite(gaussians)
+    good = finite(gaussians, "there are no Gaussians to show; train the run again")
     good = good[inside_all(loaded.placement.original_points(good.means), regions)]
     text, costs = make_page(transformed(good, turn, 1.0, still), replace(facts, look=look), most)
     found = gaussians_of(text)
@@ -103,14 +103,3 @@ def octree_page(
     shown = DrawnOctree(found.to(model.device), replace(found.scene, near=facts.near).to(model.device))
     words = f"{found.layout.num_leaves:,} leaves with harmonics of degree {found.degree}"
     return ScenePage(text, words, costs, lambda camera: shown.render_rgb(View(camera), model.background), LENSES)
-
-
-def _finite(found: Gaussians) -> Gaussians:
-    """Return the finite Gaussians, on the CPU, and report the number of others."""
-    found = found.map(lambda values: values.detach().cpu())
-    good = found[found.finite()]
-    if len(good) < len(found):
-        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are dropped")
-    if not len(good):
-        raise ConfigError("there are no Gaussians to show; train the run again")
-    return good

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from nerfloom.base.console import track
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_pixels
 from nerfloom.renderable import Renderable, RendersRays
@@ -15,6 +16,8 @@ from nerfloom.rendering.outputs import NORMALS
 
 OPAQUE = 0.5
 """Minimum opacity of a ray that ends on a surface."""
+MAX_PASSES = 32
+"""Maximum number of times that rays are drawn, since some end on no surface."""
 MAX_VIEWS = 200
 """Maximum number of views that are rendered of a method that casts no rays."""
 
@@ -74,6 +77,24 @@ def surface_points(model: RendersRays, dataset: Dataset, count: int, reach: floa
         )
 
 
+def several_passes(model: RendersRays, dataset: Dataset, count: int) -> SurfacePoints:
+    """Return at most `count` surface points of random training pixels.
+
+    Each pass draws as many rays as points are missing, because rendering them can take longer than training a field.
+
+    Args:
+        model, dataset: as in `surface_points`.
+        count: number of points, at least 1.
+    """
+    found, left, passes = list[SurfacePoints](), count, MAX_PASSES
+    for percent in track(range(100), "Looking for surfaces", total=100):
+        while passes and count - left < count * (percent + 1) / 100:
+            found.append(joined(surface_points(model, dataset, left, None)))
+            drawn = len(found[-1].positions)
+            left, passes = left - drawn, passes - 1 if drawn else 0
+    return joined(iter(found))
+
+
 @torch.no_grad()
 def picture_points(model: Renderable, dataset: Dataset, count: int, reach: float | None) -> Iterator[SurfacePoints]:
     """Return surface points at the median depth of random pixels of rendered training views, view by view.
@@ -125,7 +146,7 @@ def _within(model: Renderable, positions: Tensor, reach: float | None) -> Tensor
     return selected
 
 
-def joined(parts: Iterator[SurfacePoints]) -> SurfacePoints:
+def joined(parts: Iterable[SurfacePoints]) -> SurfacePoints:
     """Concatenate one or more `parts`; without normals if any part has none."""
     chunks = list(parts)
     normals = [chunk.normals for chunk in chunks if chunk.normals is not None]

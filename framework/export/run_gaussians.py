@@ -7,10 +7,9 @@ from pathlib import Path
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.export.run_page import moment_of
 from nerfloom.export.settings import SplatSettings
 from nerfloom.geometry.regions import Region, inside_all
-from nerfloom.splats.gaussians import HasGaussians
+from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.placed_files import in_input, write_placed
 from nerfloom.training.loaded import Loaded
 
@@ -48,6 +47,39 @@ def export_gaussians(loaded: Loaded, path: Path, settings: SplatSettings, region
         _write(loaded, model, index / max(frames - 1, 1), file, settings, regions)
 
 
+def moment_of(moving: bool, asked: float | None) -> float | None:
+    """Return the time `asked` for, of photographs that have times if `moving`; None of a static scene.
+
+    Raises:
+        ConfigError: if a static scene was asked for a time.
+        FlagError: if the time is not from 0 to 1.
+    """
+    if asked is not None and not moving:
+        raise ConfigError(f"--time {asked:g}: the photographs of this run have no times")
+    if asked is not None and not 0 <= asked <= 1:
+        raise FlagError(f"--time is {asked:g}; it must be from 0 to 1")
+    return (asked or 0.0) if moving else None
+
+
+def finite(found: Gaussians, none_left: str) -> Gaussians:
+    """Return the finite Gaussians of those `found`, on the CPU, and report the number of others.
+
+    Args:
+        found: Gaussians on any device, possibly with gradients.
+        none_left: message of the error if there are none.
+
+    Raises:
+        ConfigError: if there are none.
+    """
+    found = found.map(lambda values: values.detach().cpu())
+    good = found[found.finite()]
+    if len(good) < len(found):
+        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
+    if not len(good):
+        raise ConfigError(none_left)
+    return good
+
+
 def _write(
     loaded: Loaded,
     model: HasGaussians,
@@ -57,13 +89,8 @@ def _write(
     regions: Sequence[Region],
 ) -> None:
     """Write the Gaussians of a model at a moment, None of a static scene, to a file."""
-    found = model.gaussians(moment).map(lambda values: values.detach().cpu())
-    good = found[found.finite()]
-    if len(good) < len(found):
-        say(f"{len(found) - len(good):,} of {len(found):,} Gaussians are not finite and are left out")
-    if not len(good):
-        at = "" if moment is None else f" at time {moment:g}"
-        raise ConfigError(f"this run has no Gaussians left{at}; train it again")
+    at = "" if moment is None else f" at time {moment:g}"
+    good = finite(model.gaussians(moment), f"this run has no Gaussians left{at}; train it again")
     look, placement = model.look(), loaded.placement
     placed = in_input(good, placement)
     if regions:

@@ -14,7 +14,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, read_scale, write_scale
 from nerfloom.data.offsets import read_offset
-from nerfloom.export.run_page import moment_of
+from nerfloom.export.run_gaussians import moment_of
 from nerfloom.export.settings import LevelsSettings
 from nerfloom.geometry.regions import Region
 from nerfloom.levels.building import build_levels

@@ -21,6 +21,7 @@ from nerfloom.export.bake import Baking, bake
 from nerfloom.export.levels_page import levels_page, remove_other_chunks
 from nerfloom.export.page_closeness import closeness
 from nerfloom.export.page_scenes import BEYOND_THE_BOX, ScenePage, gaussian_page, octree_page
+from nerfloom.export.run_gaussians import moment_of
 from nerfloom.export.settings import WebSettings
 from nerfloom.export.splat_fit import fit_gaussians
 from nerfloom.export.web import (
@@ -37,10 +38,10 @@ from nerfloom.export.web import (
 )
 from nerfloom.geometry.regions import Region
 from nerfloom.levels.drawn import DrawnLevels
-from nerfloom.method import Method
 from nerfloom.octrees.drawn import DrawnOctree, DrawsOctree
 from nerfloom.octrees.files import MAX_BYTES
 from nerfloom.octrees.octree import Octree
+from nerfloom.registry import load_method
 from nerfloom.renderable import Renderable, RendersRays, with_refined_poses
 from nerfloom.scene.folded_poses import in_order
 from nerfloom.splats.drawing import smallest_depth
@@ -48,14 +49,13 @@ from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
 from nerfloom.training.datasets import first_split
 from nerfloom.training.loaded import Loaded
+from nerfloom.training.run_path import data_name
 
 PICTURE_SUFFIX = ".jpg"
 """Suffix of the picture of link previews, beside the page."""
 
 
-def export_page(
-    loaded: Loaded, path: Path, settings: WebSettings, splatting: Method, regions: Sequence[Region] = ()
-) -> None:
+def export_page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequence[Region] = ()) -> None:
     """Write the web page of a run, a file of Gaussians or an octree, and say its size and how close it comes.
 
     A JPEG file of the start view, for link previews, is written beside it, and of levels the folder of chunks.
@@ -64,7 +64,6 @@ def export_page(
         loaded: the run or file.
         path: file to write.
         settings: settings of the page.
-        splatting: the method that fits Gaussians to a field.
         regions: the page shows their intersection, in the frame of exports; it is then not compared.
 
     Raises:
@@ -103,7 +102,7 @@ def export_page(
         octree = _octree(loaded, settings.fit_seconds, room(facts, settings.max_megabytes))
         page = octree_page(loaded, octree, cameras, facts, turn, settings.max_megabytes, regions)
     else:
-        found, look = _gaussians(loaded, dataset, cameras, settings.fit_seconds, moment, splatting)
+        found, look = _gaussians(loaded, dataset, cameras, settings.fit_seconds, moment)
         page = gaussian_page(loaded, found, look, facts, turn, settings.max_megabytes, regions)
     for cost in page.costs:
         say(cost)
@@ -189,7 +188,7 @@ def _say_closeness(
 
 
 def _gaussians(
-    loaded: Loaded, dataset: Dataset | None, cameras: Cameras, seconds: float, moment: float | None, splatting: Method
+    loaded: Loaded, dataset: Dataset | None, cameras: Cameras, seconds: float, moment: float | None
 ) -> tuple[Gaussians, Look]:
     """Return the Gaussians of a run or file, or Gaussians fitted to its field, and how they are drawn."""
     model = loaded.model
@@ -200,7 +199,8 @@ def _gaussians(
     if dataset is None:
         raise ConfigError("--kind gaussians: they are fitted at the cameras of photographs: give --data DIR")
     _check_seconds(seconds)
-    return fit_gaussians(model, splatting, dataset, cameras, seconds, loaded.run.config.machine), OURS
+    splatting, machine = load_method("gaussian-splatting"), loaded.run.config.machine
+    return fit_gaussians(model, splatting, dataset, cameras, seconds, machine), OURS
 
 
 def _octree(loaded: Loaded, seconds: float, max_bytes: float) -> Octree:
@@ -221,20 +221,6 @@ def _check_seconds(seconds: float) -> None:
         raise FlagError(f"--fit-seconds is {seconds:g}; it must be positive")
 
 
-def moment_of(moving: bool, asked: float | None) -> float | None:
-    """Return the time `asked` for, of photographs that have times if `moving`; None of a static scene.
-
-    Raises:
-        ConfigError: if a static scene was asked for a time.
-        FlagError: if the time is not from 0 to 1.
-    """
-    if asked is not None and not moving:
-        raise ConfigError(f"--time {asked:g}: the photographs of this run have no times")
-    if asked is not None and not 0 <= asked <= 1:
-        raise FlagError(f"--time is {asked:g}; it must be from 0 to 1")
-    return (asked or 0.0) if moving else None
-
-
 def _at(dataset: Dataset, moment: float | None) -> Dataset:
     """Return a data set with the images of one moment."""
     return dataset if moment is None else replace(dataset, times=torch.full((len(dataset),), moment).to(dataset.device))
@@ -244,7 +230,7 @@ def _title(loaded: Loaded) -> str:
     if not loaded.is_run:
         return printable(loaded.origin.stem)
     config = loaded.run.config
-    experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
+    experiment = config.experiment_name or data_name(config.data)
     return printable(f"{experiment} · {loaded.method}")
 
 

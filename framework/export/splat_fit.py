@@ -28,14 +28,15 @@ from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import ViewBatch
 from nerfloom.data.sources import BatchSource, Request
-from nerfloom.export.points import joined, surface_points
+from nerfloom.export.points import several_passes
 from nerfloom.geometry.alignment import nearest_rotations
 from nerfloom.method import Method
 from nerfloom.renderable import RendersRays
 from nerfloom.splats.drawing import DRAWN
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.learning import number_for, rate_factor
-from nerfloom.splats.start import from_points
+from nerfloom.splats.start import on_surfaces
+from nerfloom.training.progress import take_all
 from nerfloom.training.trainer import Trainer
 
 PICTURES_SHARE = 0.45
@@ -52,10 +53,6 @@ TIMED_RAYS = 8192
 """Number of rays for measuring speed."""
 BETWEEN = 4
 """Every Nth picture is from between two cameras."""
-MAX_PASSES = 4
-"""Maximum number of rounds of drawing rays, since some rays hit no surface."""
-OPACITY, SIZE = 0.5, 0.7
-"""Initial opacity of Gaussians, and their standard deviation in mean distances to neighbours."""
 MAX_GAUSSIANS, MAX_RATE = 300_000, 5.0
 """Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 STEPS_PER_SECOND = 25
@@ -143,7 +140,10 @@ def fit_gaussians(
     begun = time.perf_counter()
     seed_step(machine.seed, 0)
     most = number_for(seconds, MAX_GAUSSIANS)
-    points, colors = _surfaces(model, dataset, most)
+    surfaces = several_passes(model, dataset, most)
+    points, colors = surfaces.positions.to(model.device), surfaces.colors.to(model.device)
+    if not len(points):
+        raise ConfigError("no training ray ends on a surface, so there is nothing to show; is the run trained?")
     shots = _shots(model, dataset, cameras, PICTURES_SHARE * seconds)
     photographs = _photographs(dataset)
     height, width = shots[0].rgb.shape[:2]
@@ -166,29 +166,12 @@ def fit_gaussians(
     trainer = Trainer(splatting, config, learnt, source=FieldPictures(learnt, shots, photographs, model.background))
     trainer.prepare(start=False)
     fitted: Any = trainer.model
-    fitted.set_gaussians(from_points(points, colors, MAX_DEGREE, OPACITY, SIZE))
-    steps = trainer.steps()
-    for percent in track(range(100), "Fitting Gaussians", total=100):
-        for report in steps:
-            if report.progress >= (percent + 1) / 100:
-                break
+    fitted.set_gaussians(on_surfaces(points, colors, MAX_DEGREE))
+    take_all(trainer.steps(), "Fitting Gaussians")
     found, dropped = fitted.gaussians(), trainer.state.skipped
     without = f" ({dropped:,} dropped: gradients not finite)" if dropped else ""
     say(f"{len(found):,} Gaussians after {trainer.state.step:,} steps{without}")
     return found
-
-
-def _surfaces(model: RendersRays, dataset: Dataset, count: int) -> tuple[Tensor, Tensor]:
-    """Return up to `count` points (K, 3) on surfaces and their colours (K, 3), on the model's device."""
-    positions, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    for _ in track(range(MAX_PASSES), "Looking for surfaces", total=MAX_PASSES):
-        if (left := count - sum(map(len, positions))) > 0:
-            found = joined(surface_points(model, dataset, 2 * left, None))
-            positions.append(found.positions[:left])
-            colors.append(found.colors[:left])
-    if not sum(map(len, positions)):
-        raise ConfigError("no training ray ends on a surface, so there is nothing to show; is the run trained?")
-    return torch.cat(positions).to(model.device), torch.cat(colors).to(model.device)
 
 
 # -- pictures -----------------------------------------------------------------------------------------------------

@@ -10,13 +10,12 @@ from nerfloom.export.lattice import lattice_of
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.meshing import Cleaning, density_mesh, distance_mesh, fused_mesh, in_input
 from nerfloom.export.seen import default_min_views
+from nerfloom.export.settings import TsdfSettings
 from nerfloom.renderable import HasDensity, HasSignedDistance, Renderable
 from nerfloom.training.loaded import Loaded
 
 SurfaceKind = Literal["marching-cubes", "tsdf"]
 """Export that makes the mesh."""
-TRUNCATION, MOST_VIEWS = 4.0, 200
-"""Truncation of fused depth, cells, and the maximum number of views that are fused."""
 
 
 def kind_for(model: Renderable) -> SurfaceKind:
@@ -59,7 +58,8 @@ def surface_mesh(
         raise ConfigError("this scene moves: export the mesh of one time (ns-export), and pass it as --mesh")
     lattice = lattice_of(model.scene.box, resolution, loaded.placement, low, high)
     if kind == "tsdf":
-        mesh = fused_mesh(model, loaded.dataset("train"), lattice, TRUNCATION, MOST_VIEWS, Cleaning())
+        defaults = TsdfSettings.truncation, TsdfSettings.max_num_views
+        mesh = fused_mesh(model, loaded.dataset("train"), lattice, *defaults, Cleaning())
     else:
         cameras = loaded.parsed("train").cameras
         if isinstance(model, HasSignedDistance):

@@ -12,14 +12,10 @@ from torch import Tensor
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import track
 from nerfloom.data.dataset import Dataset
-from nerfloom.export.points import SurfacePoints, joined, surface_points
+from nerfloom.export.points import several_passes
 from nerfloom.method import Method
 from nerfloom.renderable import RefinesPoses, parts, refined_cameras
 from nerfloom.training.trainer import Trainer
-
-MAX_PASSES = 32
-"""Maximum number of times that rays are drawn, since some end on no surface. Each pass draws as many rays as points are
-still missing, because rendering them can take longer than training the field."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +70,7 @@ def found_surfaces(
     model = trainer.model.eval()
     refined = [part.poses.tangents.detach() for part in parts(model, RefinesPoses) if part.poses is not None]
     dataset = replace(dataset, cameras=refined_cameras(model, dataset.cameras, training=True))
-    passes: list[SurfacePoints] = []
-    while (left := count - sum(len(one.positions) for one in passes)) > 0 and len(passes) < MAX_PASSES:
-        passes.append(joined(surface_points(cast("Any", model), dataset, left, None)))
-    found, cameras = joined(iter(passes)), dataset.cameras.to("cpu")
+    found, cameras = several_passes(cast("Any", model), dataset, count), dataset.cameras.to("cpu")
     images = torch.searchsorted(cameras.offsets, found.pixels, right=True) - 1
     distances = (found.positions - cameras.camera_to_worlds[images, :, 3]).norm(dim=-1)
     return FoundSurfaces(

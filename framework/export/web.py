@@ -29,6 +29,7 @@ from torch import Tensor
 
 import nerfloom
 from nerfloom.base.errors import ConfigError, DataError, FlagError
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import looked_at, rotation_between
 from nerfloom.splats.gaussian_limit import fitted_spz
@@ -149,10 +150,8 @@ def shown_cameras(count: int, start: int) -> list[int]:
         count: number of all cameras.
         start: number of the camera where the page starts.
     """
-    if count <= MAX_CAMERAS:
-        return list(range(count))
-    chosen = [rank * count // MAX_CAMERAS for rank in range(MAX_CAMERAS)]
-    nearest = min(range(MAX_CAMERAS), key=lambda rank: abs(chosen[rank] - start))
+    chosen = strided(count, MAX_CAMERAS)
+    nearest = min(range(len(chosen)), key=lambda rank: abs(chosen[rank] - start))
     chosen[nearest] = start
     return chosen
 

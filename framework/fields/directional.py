@@ -18,12 +18,10 @@ from torch.nn.functional import softplus
 
 from nerfloom.base.config import AT_LEAST_0, Range, TrainConfig
 from nerfloom.base.errors import ConfigError
-from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.base import MLP
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.color import to_srgb
 from nerfloom.kernels.encodings.integrated_directional import MAX_BANDS, directional_encoding, num_features
-from nerfloom.kernels.grids.downweighting import level_weights
 from nerfloom.kernels.math import at_least_float32, safe_normalize
 
 NORMALS, PROPERTIES = slice(1, 4), slice(4, None)
@@ -40,12 +38,6 @@ DIFFUSE_BIAS, ROUGHNESS_BIAS = -3.0, -1.0
 """Added before the activation functions. Roughness starts at a medium value, and diffuse colours start so dim that
 reflections learn first. With the paper's -log 3 on a hash grid, diffuse colours learnt everything and reflections
 vanished."""
-ENVIRONMENT_LEVELS = 0
-"""Levels of the hash grid over reflected directions (`Environment`); 0 for none."""
-COARSEST, FINEST, LOG2_ENVIRONMENT = 8, 128, 15
-"""Cells along an axis at the first and last level of that grid, and log2 of the number of entries of a level."""
-SMALLEST_ROUGHNESS = 1e-8
-"""Roughness with the sharpest possible `Environment`; lower roughness looks the same."""
 
 
 @dataclass(frozen=True)
@@ -127,59 +119,25 @@ def predicted_normals(features: Tensor) -> Tensor:
     return safe_normalize(at_least_float32(features[:, NORMALS]))
 
 
-class Environment(nn.Module):
-    """Features of the light from each direction, blurred by roughness: a hash grid over directions.
-
-    The directional encoding ends at degree 16, so that a small network can hardly tell lamps apart that are a few
-    degrees wide. The features of a level are weighted by the fraction of a direction's distribution within a cell
-    (Zip-NeRF, Barron et al. 2023, section 3.1); along an axis its variance is the roughness.
-    """
-
-    cells: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.grid = HashGrid(ENVIRONMENT_LEVELS, 2, COARSEST, FINEST, LOG2_ENVIRONMENT, sparse=True)
-        self.num_features = self.grid.num_features
-        cells = torch.tensor(self.grid.layout.resolutions, dtype=torch.float32)
-        self.register_buffer("cells", cells, persistent=False)
-
-    def forward(self, directions: Tensor, roughness: Tensor) -> Tensor:
-        """Return the features (N, E) of light.
-
-        Args:
-            directions: (N, 3) mean directions, of length 1 or less.
-            roughness: (N,) inverse concentrations of the distributions around them.
-        """
-        deviations = 0.5 * roughness.clamp(min=SMALLEST_ROUGHNESS).sqrt()  # the unit sphere has the diameter 1
-        shares = level_weights(deviations, self.cells)
-        found: Tensor = self.grid(0.5 * directions + 0.5)
-        return found * shares.repeat_interleave(found.shape[1] // shares.shape[1], dim=-1)
-
-
 class Reflection(nn.Module):
     """Light of points from properties of their surfaces, normals and viewing directions: equations 3 to 9.
 
     Args:
         network: from `num_inputs` features to specular light (N, 3) in [0, 1]. The features are the encoded reflected
-            direction, the cosine between normal and viewing direction, 1, features of the environment, the bottleneck,
-            and further ones.
+            direction, the cosine between normal and viewing direction, 1, the bottleneck, and further ones.
         bottleneck: number B of features of the bottleneck.
         bands: number of bands of the directional encoding.
-        environment: further features of the reflected direction; None for none.
     """
 
-    def __init__(
-        self, network: nn.Module, bottleneck: int, bands: int = MAX_BANDS, environment: Environment | None = None
-    ) -> None:
+    def __init__(self, network: nn.Module, bottleneck: int, bands: int = MAX_BANDS) -> None:
         super().__init__()
-        self.network, self.bands, self.environment = network, bands, environment
+        self.network, self.bands = network, bands
         self.num_features = 4 + NUM_PROPERTIES + bottleneck
         """Number of features of a density's field."""
 
     @staticmethod
     def num_inputs(bottleneck: int, bands: int = MAX_BANDS) -> int:
-        """Return the number of features that the network takes, without environment and further features.
+        """Return the number of features that the network takes, without further features.
 
         Args:
             bottleneck: number of features of the bottleneck.
@@ -202,10 +160,8 @@ class Reflection(nn.Module):
         """
         if bottleneck < 1:
             raise ConfigError(f"reflected directions need {1 - bottleneck} more features of positions (--hidden-width)")
-        environment = Environment() if ENVIRONMENT_LEVELS else None
-        inputs = cls.num_inputs(bottleneck, bands) + more + (0 if environment is None else environment.num_features)
-        network = MLP(inputs, *[width] * LAYERS, 3, bias=False, activation="sigmoid")
-        return cls(network, bottleneck, bands, environment)
+        inputs = cls.num_inputs(bottleneck, bands) + more
+        return cls(MLP(inputs, *[width] * LAYERS, 3, bias=False, activation="sigmoid"), bottleneck, bands)
 
     def forward(self, properties: Tensor, normals: Tensor, directions: Tensor, *more: Tensor) -> Light:
         """Return the light of points.
@@ -220,9 +176,7 @@ class Reflection(nn.Module):
         away = (normals * directions).sum(-1, keepdim=True)
         reflected = directions - 2 * away * normals
         # The encoding lacks the constant harmonic. Without it a network without biases has no thresholds.
-        inputs = [directional_encoding(reflected, roughness, self.bands), -away, torch.ones_like(away)]
-        if self.environment is not None:
-            inputs.append(self.environment(reflected, roughness))
+        inputs = directional_encoding(reflected, roughness, self.bands), -away, torch.ones_like(away)
         seen = self.network(*inputs, properties[:, NUM_PROPERTIES:], *more)
         specular = torch.sigmoid(properties[:, TINT]) * at_least_float32(seen)
         return Light(torch.sigmoid(properties[:, DIFFUSE] + DIFFUSE_BIAS), specular, roughness, normals)

@@ -22,41 +22,23 @@ FREQUENCIES = 6
 class TransientHead(nn.Module):
     """Density, colour and uncertainty that exist in one image alone: NeRF-W, equation 10.
 
-    Each image has vectors at the vertices of a square grid over it, with interpolation between them. With one vertex,
-    this is the paper's transient vector.
-
     Args:
         num_features: number F of features of the field.
-        size: length S of a vector.
-        resolution: vertices along each side of an image's map.
+        num_images: number of training images.
+        size: length S of an image's vector.
         width: features of a hidden layer.
         box: (2, 3) corners of the box, scene units.
-        camera_to_worlds: (M, 3, 4) poses of the training cameras.
         start: density before training, 1/length.
     """
 
     box: Tensor
-    turns: Tensor
-    reach: Tensor
 
-    def __init__(
-        self,
-        num_features: int,
-        size: int,
-        resolution: int,
-        width: int,
-        box: Tensor,
-        camera_to_worlds: Tensor,
-        start: float,
-    ) -> None:
+    def __init__(self, num_features: int, num_images: int, size: int, width: int, box: Tensor, start: float) -> None:
         super().__init__()
-        require(4.0 * len(camera_to_worlds) * resolution**2 * size, "the transient vectors of all images")
-        self.resolution = resolution
-        self.vectors = nn.Parameter(torch.zeros(len(camera_to_worlds) * resolution**2, size))
+        require(4.0 * num_images * size, "the transient vectors of all images")
+        self.vectors = nn.Parameter(torch.zeros(num_images, size))
         self.network = MLP(num_features + size + 3 + 6 * FREQUENCIES, width, width, 5)
         self.register_buffer("box", box.clone())
-        self.register_buffer("turns", camera_to_worlds[:, :, :3].clone())
-        self.register_buffer("reach", torch.ones(()))  # tangent of the widest angle between a ray and its camera's axis
         self.start = start
         self._shown: int | None = None
 
@@ -66,7 +48,7 @@ class TransientHead(nn.Module):
         Args:
             features: (N, F) features of the field.
             positions: (N, 3) scene coordinates.
-            vectors: (N, S) vector of each sample's image at the ray's position in it.
+            vectors: (N, S) vector of each sample's image.
         """
         placed = frequency_encoding(2 * contract_to_unit(positions, self.box) - 1, FREQUENCIES)
         density, found = self.network.density(features, vectors.to(features.dtype), placed.to(features.dtype))
@@ -74,7 +56,7 @@ class TransientHead(nn.Module):
 
     @contextmanager
     def shown(self, image: int) -> Iterator[None]:
-        """Give rays of no training image the vectors of the training image `image`, within a `with` block."""
+        """Give rays of no training image the vector of the training image `image`, within a `with` block."""
         self._shown, previous = image, self._shown
         try:
             yield
@@ -82,20 +64,8 @@ class TransientHead(nn.Module):
             self._shown = previous
 
     def vectors_of(self, rays: Rays) -> Tensor | None:
-        """Return the vector (R, S) of each ray's image at the ray's position; None if rays have no training image."""
+        """Return the vector (R, S) of each ray's image; None if rays have no training image."""
         images = rays.camera_indices
         if images is None and self._shown is not None:
             images = torch.full((len(rays),), self._shown, device=rays.origins.device)
-        if images is None:
-            return None
-        local = torch.einsum("rij,ri->rj", self.turns.to(rays.directions)[images], rays.directions.detach())
-        across = local[:, :2] / (local[:, 2:].neg().clamp(min=1e-3) * self.reach)  # -1 and 1 at the edges
-        place = (across.clamp(-1, 1) + 1) / 2 * (self.resolution - 1)
-        low = place.floor().clamp(max=max(self.resolution - 2, 0))
-        share, total = place - low, torch.zeros((), device=place.device)
-        for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
-            column, row = ((low[:, k] + s).clamp(max=self.resolution - 1).long() for k, s in ((0, x), (1, y)))
-            weight = (share[:, 0] if x else 1 - share[:, 0]) * (share[:, 1] if y else 1 - share[:, 1])
-            vertex = (images * self.resolution + row) * self.resolution + column
-            total = total + weight[:, None].to(self.vectors) * functional.embedding(vertex, self.vectors)
-        return total
+        return None if images is None else functional.embedding(images, self.vectors)

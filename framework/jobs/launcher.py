@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
 from nerfloom.base.console import say
+from nerfloom.base.errors import FlagError
 from nerfloom.jobs.job import Failure, Job
 
 
@@ -18,7 +19,17 @@ class Launcher(ABC):
 
     Jobs write the same files with every launcher. Finished jobs are not run again, and stopped jobs are resumed. So the
     same call, even with another launcher, continues after an interruption.
+
+    Raises:
+        FlagError: if `at_once` is less than 1.
     """
+
+    at_once: int | None
+    """Maximum number of simultaneous jobs; None for all that have room."""
+
+    def __post_init__(self) -> None:
+        if self.at_once is not None and self.at_once < 1:
+            raise FlagError(f"--jobs is {self.at_once}; it must be at least 1")
 
     @property
     @abstractmethod

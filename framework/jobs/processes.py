@@ -13,7 +13,7 @@ from queue import Queue
 from rich.status import Status
 
 from nerfloom.base.console import console
-from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.errors import ConfigError
 from nerfloom.base.signals import stoppable
 from nerfloom.jobs.child import last_line
 from nerfloom.jobs.execution import execute
@@ -30,10 +30,6 @@ class Processes(Launcher):
     """
 
     at_once: int = 1
-
-    def __post_init__(self) -> None:
-        if self.at_once < 1:
-            raise FlagError(f"--jobs is {self.at_once}; it must be at least 1")
 
     @property
     def sharing(self) -> str | None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.errors import ConfigError
 from nerfloom.base.extras import install_command
 from nerfloom.base.signals import stoppable
 from nerfloom.jobs.child import GRACE
@@ -45,10 +45,6 @@ class Ray(Launcher):
 
     at_once: int | None = None
     address: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.at_once is not None and self.at_once < 1:
-            raise FlagError(f"--jobs is {self.at_once}; it must be at least 1")
 
     @property
     def sharing(self) -> str | None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError, FlagError, printable
+from nerfloom.base.errors import ConfigError, printable
 from nerfloom.jobs.job import Failure, Job, Step
 from nerfloom.jobs.launcher import Launcher, Ledger, nothing
 
@@ -33,10 +33,6 @@ class Slurm(Launcher):
 
     folder: Path
     at_once: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.at_once is not None and self.at_once < 1:
-            raise FlagError(f"--jobs is {self.at_once}; it must be at least 1")
 
     @property
     def sharing(self) -> str | None:

@@ -24,8 +24,6 @@ COARSE_SHARE = 0.1
 """Weight of a coarse level's penalty, relative to the fine one's."""
 SHARE = 1 / 16
 """`PredictedNormals` uses at most this fraction of the samples, on average."""
-WEIGHTS_LEARN = False
-"""Whether samples with a penalty also lose weight, as in the authors' code. Otherwise only normals change."""
 
 
 class NormalPenalty(LossTerm):
@@ -83,12 +81,12 @@ def penalties(rendered: Rendered, rays: Rays, field: Field) -> dict[str, Tensor]
     assert samples is not None
     assert samples.features is not None
     assert weights is not None
-    places, factors = drawn(weights.detach(), SHARE)
+    weights = weights.detach()  # the penalties change normals only; in the authors' code, samples also lose weight
+    places, factors = drawn(weights, SHARE)
     columns = samples.ray_indices, samples.t_starts, samples.t_ends, samples.t
     owners, starts, ends, t = (each.detach().index_select(0, places) for each in columns)
     positions = rays.points(owners, t).detach()
     points = interval_points(rays, owners, Wave(starts, ends, owners, positions), positions, field.footprint)
-    weights = weights if WEIGHTS_LEARN else weights.detach()
     shares = weights.index_select(0, places) * factors / max(samples.num_rays, 1)
     predicted = predicted_normals(samples.features.index_select(0, places))
     apart = normal_difference(predicted, field.density_normals(points))

@@ -27,6 +27,8 @@ AFFINE = 12
 GRID = (4, 8, 8)
 """Vertices of a bilateral grid: levels of luminance, rows and columns. Wang et al. 2024 have 8, 16 and 16; smaller
 grids learn from fewer pixels."""
+RATE = 1e-3
+"""Initial learning rate of the parameters."""
 STOPS = 3.0
 """Stops per unit of an exposure's parameter. A step of Adam then changes mid grey by a similar amount as in affine
 functions."""
@@ -81,7 +83,7 @@ class Light(Appearance, ABC):
 
     def __init__(self, size: int, config: AppearanceConfig, scene: Scene) -> None:
         require(4.0 * size * scene.num_cameras, "the appearance of all images")
-        optimised = Optimised("appearance", config.appearance_rate)
+        optimised = Optimised("appearance", RATE)
         super().__init__(size, scene.num_cameras, optimised, config.mean_appearance_share, config.eval_appearance)
 
     def lit(

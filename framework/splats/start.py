@@ -20,6 +20,8 @@ from nerfloom.splats.gaussians import Gaussians
 
 OPACITY = 0.1
 """Initial opacity."""
+SURFACE_OPACITY, SURFACE_SIZE = 0.5, 0.7
+"""Initial opacity on a field's surfaces, and standard deviation there, in mean distances to the nearest neighbours."""
 HULL_CELLS = 128
 """Cells of the visual hull along an axis."""
 MAX_MEASURED = 1_000
@@ -56,6 +58,15 @@ def from_points(points: Tensor, colors: Tensor, degree: int, opacity: float = OP
     return Gaussians(
         points, distance.log()[:, None].expand(-1, 3).clone(), turn, logits, (colors - 0.5) / DC, harmonics
     )
+
+
+def on_surfaces(points: Tensor, colors: Tensor, degree: int) -> Gaussians:
+    """Return Gaussians of `degree` at `points` (N, 3) on a field's surfaces, which are smaller and more opaque.
+
+    Args:
+        colors: (N, 3) in [0, 1].
+    """
+    return from_points(points, colors, degree, SURFACE_OPACITY, SURFACE_SIZE)
 
 
 def neighbour_distance(points: Tensor, neighbours: int = NEIGHBOURS, outside: float = 0.0) -> Tensor:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras, subpixels
 from nerfloom.data.dataset import Dataset, load_dataset
@@ -22,7 +23,6 @@ from nerfloom.data.image_files import reduce_image
 from nerfloom.data.parsed_scene import DataParser
 from nerfloom.data.pixels.pixel_set import PixelSet
 from nerfloom.data.scene import Scene
-from nerfloom.evaluation.evaluator import spread
 from nerfloom.testing.ball import RADIUS, cameras_at, trace
 
 HALF_SIZE = 1.5
@@ -133,7 +133,7 @@ def data_views(parser: DataParser, data: Path | None) -> Views:
 
 def _few(parser: DataParser, data: Path | None, split: Split, count: int) -> Dataset:
     parsed = parser.parse(data, split)
-    few = parsed[torch.tensor(spread(len(parsed.image_paths), count))]
+    few = parsed[torch.tensor(strided(len(parsed.image_paths), count))]
     return reduced(load_dataset(replace(few, num_scales=1), split), LONGER_SIDE)
 
 

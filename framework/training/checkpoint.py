@@ -200,14 +200,7 @@ def _is_sealed(path: Path) -> bool:
 
 
 def load_newest(folder: Path, device: torch.device | str = "cpu") -> dict[str, Any] | None:
-    """Return the content of the newest readable checkpoint in a folder, as `find_newest` does.
-
-    Args:
-        folder: folder of the checkpoints.
-        device: device of the tensors.
-
-    Returns:
-        The content; None if the folder has no checkpoint.
+    """Return the content of the newest readable checkpoint in a `folder`, on `device`; None if it has none.
 
     Raises:
         CheckpointError: if there are checkpoints, but none can be read.

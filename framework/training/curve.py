@@ -16,9 +16,10 @@ from statistics import fmean
 from typing import Any, TypeAlias
 
 from nerfloom.base.device import runs_ahead
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.base.json_files import finite_or_null
 from nerfloom.data.dataset import Dataset
-from nerfloom.evaluation.evaluator import Measured, measure_view, spread, views_to_judge
+from nerfloom.evaluation.evaluator import Measured, measure_view, views_to_judge
 from nerfloom.renderable import Renderable, with_refined_poses
 from nerfloom.training.progress import StepReport
 
@@ -127,7 +128,7 @@ class FewImages:
         views = views_to_judge(dataset)
         self._dataset, self._rays_per_pixel = dataset, rays_per_pixel
         few = MAX_IMAGES if limit is None else min(limit, MAX_IMAGES)
-        self._views = [views[index] for index in spread(len(views), few)]
+        self._views = [views[index] for index in strided(len(views), few)]
         cameras = dataset.cameras
         self._sizes = [(int(cameras.heights[view]), int(cameras.widths[view])) for view in self._views]
 

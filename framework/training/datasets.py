@@ -6,10 +6,10 @@ import torch
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.base.splits import Split
 from nerfloom.data.dataset import Dataset, load_dataset
 from nerfloom.data.pixels.cache import PixelMemory
-from nerfloom.evaluation.evaluator import spread
 from nerfloom.training.run import Run
 
 
@@ -30,7 +30,7 @@ def load_split(run: Run, split: Split, most: int | None = None) -> Dataset:
     masks = run.config.masks if split == "train" else "ignored"
     parsed = run.parse(split)
     if most is not None and parsed.num_scales == 1 and parsed.source_images is None:
-        parsed = parsed[torch.tensor(spread(len(parsed.image_paths), most), dtype=torch.int64)]
+        parsed = parsed[torch.tensor(strided(len(parsed.image_paths), most), dtype=torch.int64)]
     return load_dataset(parsed, split, memory, masks)
 
 

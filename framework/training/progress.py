@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ import torch
 from rich.progress import BarColumn, Progress, TextColumn
 from torch import Tensor
 
-from nerfloom.base.console import SECONDS_BETWEEN_LINES, console, say
+from nerfloom.base.console import SECONDS_BETWEEN_LINES, console, say, track
 from nerfloom.base.meter import UNKNOWN, left_text, time_text
 
 if TYPE_CHECKING:
@@ -111,6 +111,14 @@ class ProgressBar:
         if not console.is_terminal and now - self._last_line > SECONDS_BETWEEN_LINES:
             self._last_line = now
             say(f"{report.seconds:5.0f} s  {share_and_time(self._first, report)}  {report.line()}")
+
+
+def take_all(steps: Iterator[StepReport], title: str) -> None:
+    """Take all `steps` of a training within another task, and show the spent share of its budget after a `title`."""
+    for percent in track(range(100), title, total=100):
+        for report in steps:
+            if report.progress >= (percent + 1) / 100:
+                break
 
 
 class Rate:

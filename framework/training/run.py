@@ -40,7 +40,7 @@ from nerfloom.data.parsed_scene import DataParser, ParsedScene
 from nerfloom.data.training_images import chosen_images
 from nerfloom.registry import load_dataparser, load_method
 from nerfloom.training.data_folder import find_data
-from nerfloom.training.run_path import CONFIG, config_file
+from nerfloom.training.run_path import CONFIG, config_file, data_name
 
 TRANSFORMS = "dataparser_transforms.json"
 """Name of the placement in a run's folder."""
@@ -122,7 +122,7 @@ def _moved(parsed: ParsedScene, then: Placement) -> float:
 
 def run_folder(method: str, config: TrainConfig) -> Path:
     """Return the folder of a new run of `method`: outputs/{experiment}/{method}/{timestamp}."""
-    experiment = config.experiment_name or (config.data.resolve().name if config.data else "procedural")
+    experiment = config.experiment_name or data_name(config.data)
     timestamp = config.timestamp or datetime.now().strftime(TIMESTAMP)
     return config.output_dir / experiment / method / timestamp
 

@@ -76,6 +76,11 @@ def trained_run(path: Path, checkpoint: Path | None = None, data: Path | None = 
     return found
 
 
+def data_name(data: Path | None) -> str:
+    """Return the name of the folder `data` in names of folders and files; procedural for the embedded scene, None."""
+    return "procedural" if data is None else data.resolve().name
+
+
 def check_data(data: Path) -> None:
     """Check that the folder `data`, or a part of one, exists.
 

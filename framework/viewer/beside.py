@@ -1,4 +1,4 @@
-"""A second run beside the first: both are drawn from the same camera, and a divider separates them."""
+"""Another run or file of the same scene: drawn in place of the first, or beside it, with a divider between them."""
 
 from __future__ import annotations
 
@@ -31,6 +31,20 @@ def check_beside(loaded: Loaded, second: Loaded) -> None:
             raise ConfigError(f"{one.origin} is in normalised device coordinates (--ndc): it can only be shown alone")
 
 
+def draw_other(loaded: Loaded, other: Loaded, request: Request, piece: Piece, truth: Truth | None = None) -> Arrays:
+    """Draw a piece of a view of another run or file: the arrays that the requested output needs.
+
+    Args:
+        loaded: the first run.
+        other: the other one, possibly with another placement of its scene.
+        request: the view, in the frame of the first run's scene.
+        piece: rows at a stride.
+        truth: true images, as in `draw`.
+    """
+    there = other.scaled(loaded.scale)
+    return draw(there, request.moved(*loaded.placement.similarity_to(there.placement)), piece, None, truth)
+
+
 def draw_beside(
     loaded: Loaded, second: Loaded | None, request: Request, piece: Piece, ndc: Ndc | None, truth: Truth | None = None
 ) -> Arrays:
@@ -38,7 +52,7 @@ def draw_beside(
 
     Args:
         loaded: the first run, left of the divider.
-        second: the second run, possibly with another placement of its scene; None for the first alone.
+        second: the second run; None for the first alone.
         request: the view, in the frame of the first run's scene.
         piece: rows at a stride.
         ndc: normalised device coordinates of the scene; None if it has none.
@@ -52,9 +66,7 @@ def draw_beside(
         camera = request.camera(piece.stride, (piece.top, piece.bottom))
         return None if truth is None else truth(replace(view, camera=camera, time=request.time), rgb, background)
 
-    there = second.scaled(loaded.scale)
-    moved = request.moved(*loaded.placement.similarity_to(there.placement))
-    right = draw(there, moved, piece, None, truth_here)
+    right = draw_other(loaded, second, request, piece, truth_here)
     return joined(draw(loaded, request, piece, None, truth), right, request.divider)
 
 

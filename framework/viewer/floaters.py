@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.data.sparse_depth import sparse_depth
 from nerfloom.edit.drop import floating
 from nerfloom.edit.edited import Edited
-from nerfloom.evaluation.evaluator import CLEAR_SHARE, spread
+from nerfloom.evaluation.evaluator import CLEAR_SHARE
 from nerfloom.renderable import RendersRays
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.loaded import Loaded
@@ -68,7 +69,7 @@ def _in_front_of_points(loaded: Loaded) -> Floaters:
     cameras = parsed.cameras.scaled(1 / parsed.downscale_factor)
     known = sparse_depth(parsed.sightings, cameras)
     known = known[known.deviations < (1 - CLEAR_SHARE) / 3 * known.distances]
-    known = known[torch.tensor(spread(len(known), MAX_POINTS), dtype=torch.int64)].to(model.device)
+    known = known[torch.tensor(strided(len(known), MAX_POINTS), dtype=torch.int64)].to(model.device)
     times = None if parsed.times is None else parsed.times.to(model.device)
     seen, places = cameras.to(model.device), [torch.zeros(0, 3)]
     for start in range(0, len(known), model.rays_at_once):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from nerfloom.export.occupancy import innermost
 from nerfloom.renderable import Renderable, parts
 from nerfloom.samplers.base import SkipsCells
 
@@ -29,8 +30,7 @@ def shown_cells(model: Renderable, most: int = MAX_CELLS) -> tuple[Tensor, float
     if not samplers:
         return None
     sampler = samplers[0]
-    n, box = sampler.resolution, sampler.box.cpu()
-    grid = sampler.occupied_when()[: n**3].cpu().view(n, n, n)
+    grid, box = innermost(sampler), sampler.box.cpu()
     padded = torch.nn.functional.pad(grid, (1, 1, 1, 1, 1, 1))
     inside = grid.clone()
     for axis in range(3):
@@ -38,5 +38,5 @@ def shown_cells(model: Renderable, most: int = MAX_CELLS) -> tuple[Tensor, float
             inside &= padded.roll(shift, axis)[1:-1, 1:-1, 1:-1]
     cells = (grid & ~inside).nonzero()
     cells = cells[:: -(-len(cells) // most) or 1]
-    edge = (box[1] - box[0]) / n
+    edge = (box[1] - box[0]) / sampler.resolution
     return box[0] + (cells + 0.5) * edge, float(edge.mean())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +20,6 @@ from nerfloom.viewer.crop_panel import CropPanel
 from nerfloom.viewer.export_panel import ExportPanel
 from nerfloom.viewer.floater_panel import FloaterPanel
 from nerfloom.viewer.floaters import can_find
-from nerfloom.viewer.keys import Key, add_keys
 from nerfloom.viewer.measure_panel import MeasurePanel
 from nerfloom.viewer.panel import Panel
 from nerfloom.viewer.path_panel import PathPanel
@@ -30,6 +30,17 @@ from nerfloom.viewer.viewpoint import FIRST_FOV, Viewpoint
 
 if TYPE_CHECKING:
     import viser
+
+
+class Key(NamedTuple):
+    """A key of the page, and its action. Ctrl-K lists all keys."""
+
+    key: str
+    """Upper-case letter other than W, A, S, D, Q and E, which move the camera."""
+    label: str
+    """Name of the action."""
+    action: Callable[[], object]
+    """The action."""
 
 
 class Page:
@@ -76,7 +87,7 @@ class Page:
         if panel.crop is not None:
             self._panels[number], others = self._add_tabs(client, tabs, panel, panel.crop, viewpoint)
             keys += others
-        add_keys(client, keys)
+        _add_keys(client, keys)
         if number not in self._server.get_clients():  # the browser left before it was set up
             self._farewell(client)
 
@@ -167,3 +178,9 @@ class Page:
                 part.close()
         if self._commands is not None:
             self._commands.close()
+
+
+def _add_keys(client: viser.ClientHandle, keys: Iterable[Key]) -> None:
+    """Make keys known to a browser."""
+    for key in keys:
+        client.gui.add_command(key.label, hotkey=key.key).on_trigger(lambda _, action=key.action: action())

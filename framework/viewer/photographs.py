@@ -16,13 +16,13 @@ from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import NerfloomError
+from nerfloom.base.evenly_spaced import strided
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import Ndc, NdcCameras
 from nerfloom.cameras.view import View
 from nerfloom.data.image_files import Content, read_image
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.batch import composite
-from nerfloom.evaluation.evaluator import spread
 from nerfloom.renderable import Renderable, refined_cameras
 from nerfloom.training.run import Run
 from nerfloom.viewer.request import Pose
@@ -81,7 +81,7 @@ class Photographs:
 
     def chosen(self) -> list[int]:
         """Return the indices of the images with cameras shown, at most `MAX_SHOWN`, evenly spaced."""
-        return [] if self._given is None else spread(len(self._given), MAX_SHOWN)
+        return [] if self._given is None else strided(len(self._given), MAX_SHOWN)
 
     def name(self, index: int) -> str:
         """Return the file name of image `index`."""

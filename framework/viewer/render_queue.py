@@ -9,15 +9,14 @@ from collections.abc import Callable
 from typing import cast
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import NerfloomError
+from nerfloom.base.errors import NerfloomError, one_line
 from nerfloom.cameras.ndc import Ndc
 from nerfloom.evaluation.outputs import Arrays
 from nerfloom.renderable import RendersRays
 from nerfloom.training.loaded import Loaded
-from nerfloom.viewer.beside import draw_beside
+from nerfloom.viewer.beside import draw_beside, draw_other
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.drawing import Truth
-from nerfloom.viewer.in_motion import draw_in_motion, is_shared
 from nerfloom.viewer.pace import Piece, Rays, Speed, coarse_stride, next_browser, refinement
 from nerfloom.viewer.request import Request, smaller
 
@@ -27,7 +26,8 @@ NO_LIMIT = 1e6
 """Time limit for a piece of a method that casts no rays, seconds, so large that a piece is the whole picture. Gaussians
 near an image's border depend on the image's size, so strips of it would differ from the whole: on fox they had 28
 dB."""
-
+SHARED = ("rgb", "depth", "accumulation")
+"""Outputs that look alike in a run and in a faster file of its scene."""
 PROBLEMS = NerfloomError, MemoryError, RuntimeError, ValueError
 """Errors of a picture or a task that the viewer reports without stopping."""
 
@@ -127,7 +127,7 @@ class RenderQueue:
         try:
             self._serve(browser)
         except PROBLEMS as error:
-            say(f"viewer: a picture could not be drawn: {_reason(error)}")
+            say(f"viewer: a picture could not be drawn: {one_line(error)}")
             browser.drawn, browser.pieces, browser.step = browser.wanted, [], self.loaded.step
         browser.served_at = time.monotonic()
         return time.perf_counter() - start
@@ -138,7 +138,7 @@ class RenderQueue:
         try:
             task()
         except PROBLEMS as error:
-            say(f"viewer: {_reason(error)}")
+            say(f"viewer: {one_line(error)}")
         return time.perf_counter() - start
 
     def _serve(self, browser: Browser) -> None:
@@ -147,7 +147,7 @@ class RenderQueue:
         assert request is not None
         if request != browser.drawn:
             # The run draws its first picture itself: its speed determines the size of its pieces.
-            quick = self._quick if self._speed.measured and is_shared(request) else None
+            quick = self._quick if self._speed.measured and _is_shared(request) else None
             speed = self._speed if quick is None else self._quick_speed
             stride = coarse_stride(speed, request.width, request.height, self.coarse_seconds, browser.stride)
             whole = Piece(stride, 1, 0, smaller(request.width, request.height, stride)[1])
@@ -181,15 +181,16 @@ class RenderQueue:
     def _quickly(self, quick: Loaded, request: Request, piece: Piece) -> Arrays:
         """Draw a piece of the faster file and measure its time."""
         start = time.perf_counter()
-        kept = draw_in_motion(self.loaded, quick, request, piece)
+        kept = draw_other(self.loaded, quick, request, piece)
         self._quick_speed = self._quick_speed.with_one(_rays_of(request, piece), time.perf_counter() - start)
         return kept
+
+
+def _is_shared(request: Request) -> bool:
+    """Return whether a faster file can show the picture of a request, with arrays of the same names as the run's."""
+    return request.output in SHARED and not request.overlay
 
 
 def _rays_of(request: Request, piece: Piece) -> int:
     columns, _ = smaller(request.width, request.height, piece.stride)
     return columns * (piece.bottom - piece.top) * piece.rays
-
-
-def _reason(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__

@@ -7,10 +7,11 @@ import time
 from pathlib import Path
 
 from nerfloom.base.console import say
-from nerfloom.cameras.ndc import Ndc
+from nerfloom.base.errors import NerfloomError
+from nerfloom.training.checkpoint import FOLDER, list_checkpoints
 from nerfloom.training.loaded import Loaded
+from nerfloom.training.trained import load_parameters
 from nerfloom.viewer.beside import check_beside
-from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.render_queue import RenderQueue
@@ -43,7 +44,7 @@ def view_loaded(
     for other in (second, quick):
         if other is not None:
             check_beside(loaded, other)
-    ndc = _ndc(loaded.model.scene.warped, photographs)
+    ndc = photographs.ndc if loaded.model.scene.warped else None
     queue = RenderQueue(loaded, ndc=ndc, truth=photographs.truth, second=second, quick=quick)
     server = open_server(host, port, "nerfloom")
     page = Page(server, queue, photographs, may_start=follow)
@@ -78,5 +79,18 @@ def _follow(queue: RenderQueue, page: Page, seen: Path) -> Path:
     return newer
 
 
-def _ndc(warped: bool, photographs: Photographs) -> Ndc | None:
-    return photographs.ndc if warped else None
+def newer_checkpoint(folder: Path, seen: Path | None) -> Path | None:
+    """Return the newest checkpoint in a run's `folder`, unless it was `seen` before."""
+    try:
+        newest = list_checkpoints(folder / FOLDER)[-1:]
+    except OSError:
+        return None
+    return newest[0] if newest and newest[0] != seen else None
+
+
+def reloaded(loaded: Loaded, checkpoint: Path) -> Loaded | str:
+    """Return the run `loaded` with parameters of a newer `checkpoint`, or the reason why it cannot be read."""
+    try:
+        return load_parameters(loaded.run, checkpoint)
+    except (NerfloomError, OSError) as error:
+        return f"{checkpoint.name} cannot be shown: {error}"

@@ -124,7 +124,7 @@ def test_flags_stand_with_what_they_belong_to() -> None:
         "nerfacto": ["--num-levels", "--camera-learning-rate"],
         "sampler": ["--sampler", "--early-stop", "--num-proposal-samples", "--silhouette-pixels"],
         "ray": ["--num-rays-per-batch", "--train-rays-per-pixel-from"],
-        "robust": ["--robust", "--robust-factor"],
+        "robust": ["--robust"],
         "teacher": ["--teacher", "--teacher-share", "--teacher-until"],
         "optimisation": ["--learning-rate", "--lr-schedule", "--adam-eps"],
         "evaluation and saving": ["--steps-per-save", "--max-eval-images", "--target-psnr", "--load-checkpoint"],
@@ -132,7 +132,7 @@ def test_flags_stand_with_what_they_belong_to() -> None:
     }
     for title, flags in belongs.items():
         assert set(flags) <= set(found[f"{title} options"])
-    light = ["--appearance", "--appearance-rate", "--eval-appearance", "--mean-appearance-share"]
+    light = ["--appearance", "--eval-appearance", "--mean-appearance-share"]
     assert plain["appearance options"] == light
     assert found["appearance options"] == [*light, "--appearance-embedding-dim"]
     assert "--num-coarse-samples" in plain["sampler options"]

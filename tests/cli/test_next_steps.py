@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from nerfloom.cli.next_steps import after_training
+from nerfloom.cli.session import after_training
 from nerfloom.data.scene import Scene
 from nerfloom.processing.output import ready
 

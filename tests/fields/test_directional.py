@@ -4,12 +4,9 @@ import dataclasses
 
 import pytest
 import torch
-from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.fields import directional
-from nerfloom.fields.directional import Environment, HasLight
 from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.surface import SurfaceField
 from nerfloom.geometry.points import Points
@@ -97,41 +94,6 @@ def test_an_appearance_changes_reflected_light() -> None:
 def test_what_contradicts_it_is_refused(kind: str, settings: dict[str, object], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         trainer_of(kind, **settings)
-
-
-def test_an_environment_is_blurred_by_roughness(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mirror sees the features themselves, a matt surface none, and a rough one hardly any of the finest level."""
-    monkeypatch.setattr(directional, "ENVIRONMENT_LEVELS", 3)
-    torch.manual_seed(0)
-    environment = Environment()
-    torch.nn.init.normal_(environment.grid.table)
-    directions = normalize(torch.randn(200, 3), dim=-1)
-
-    def sizes(roughness: float) -> Tensor:
-        """Mean size of the features of each level."""
-        found = environment(directions, torch.full((200,), roughness))
-        return found.view(200, 3, 2).abs().mean((0, 2))
-
-    torch.testing.assert_close(environment(directions, torch.zeros(200)), environment.grid(0.5 * directions + 0.5))
-    sharp, rough = sizes(0.0), sizes(0.01)
-    assert rough[0] / sharp[0] > 2 * rough[2] / sharp[2]
-    assert float(sizes(1e6).max()) < 1e-3
-    roughness = torch.zeros(200, requires_grad=True)
-    environment(directions.requires_grad_(), roughness).sum().backward()
-    assert roughness.grad is not None
-    assert directions.grad is not None
-    assert bool((roughness.grad.isfinite()[:, None] & directions.grad.isfinite()).all())
-
-
-@pytest.mark.parametrize("kind", ["instant-ngp", "neus"])
-def test_an_environment_learns(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(directional, "ENVIRONMENT_LEVELS", 3)
-    trainer = trainer_of(kind)
-    environment = trainer.model.field.reflection.environment
-    before = environment.grid.table.clone()
-    trainer.train_step()
-    assert isinstance(trainer.model.field, HasLight)
-    assert float((environment.grid.table != before).float().mean()) > 0.01
 
 
 @pytest.mark.medium

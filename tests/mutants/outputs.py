@@ -56,7 +56,7 @@ MUTANTS = {
             "blocks/test_merge.py::test_what_all_blocks_have_learned_is_there_once"),
     ],
     "nerfloom.viewer.beside": [
-        Mutant("another-place", "draw_beside", "request.moved(*A)", "request",
+        Mutant("another-place", "draw_other", "request.moved(*A)", "request",
             "the second run is seen from another place than the first",
             "viewer/test_beside.py::test_what_is_the_same_looks_the_same_in_both_scenes"),
     ],
@@ -99,6 +99,11 @@ MUTANTS = {
         Mutant("pixel-error-not-squared", "point_covariance", "A / pixel_error ** 2", "A / pixel_error",
             "errors of lengths are too large by the root of two",
             "test_triangulation.py::test_the_covariance_is_that_of_least_squares"),
+    ],
+    "nerfloom.base.evenly_spaced": [
+        Mutant("spread-first-views", "spread", "[index * total // limit for index in A]", "list(A)",
+            "--max-images judges the first views alone",
+            "evaluation/test_evaluator.py::test_pictures_are_of_views_evenly_spaced_and_of_the_worst"),
     ],
     "nerfloom.edit.drop": [
         Mutant("floaters-however-opaque", "floating", "A & (seen.opacity_in_front <= max_opacity)", "A",
@@ -145,9 +150,6 @@ MUTANTS = {
         Mutant("masked-windows-count", "measure", "quick_ssim(A, B, kept)", "quick_ssim(A, B)",
             "what masks ignore counts as perfect in SSIM",
             "test_masks.py::test_ignored_pixels_do_not_count_in_evaluation"),
-        Mutant("spread-first-views", "spread", "[index * total // limit for index in A]", "list(A)",
-            "--max-images judges the first views alone",
-            "evaluation/test_evaluator.py::test_pictures_are_of_views_evenly_spaced_and_of_the_worst"),
         Mutant("few-called-all", "evaluate", "{'num_images': A, 'num_images_in_split': len(views)}",
             "{'num_images': A, 'num_images_in_split': A}",
             "an evaluation of some images is said to be of all",

@@ -440,13 +440,16 @@ def test_a_resumed_run_has_the_same_bits(kind: str, shared_tiny: Path, tmp_path:
 
 @pytest.mark.medium
 @pytest.mark.parametrize("kind", ["tone", "grid"])
-def test_half_of_a_dark_photograph_tells_its_light(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
+def test_half_of_a_dark_photograph_tells_its_light(
+    kind: str, shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """And the nearest photograph, which is itself here, tells it too.
 
     Colours do not depend on the direction. Otherwise they would explain the light, since each camera has its own.
     """
     factors = torch.tensor([0.4, 1.0]).repeat(5)
-    settings = {"max_num_iterations": 200, "appearance_rate": 1e-2, "background": "black", "view_dependence": False}
+    monkeypatch.setattr("nerfloom.rendering.light.RATE", 1e-2)
+    settings = {"max_num_iterations": 200, "background": "black", "view_dependence": False}
     trainer = dimmed("instant-ngp", kind, shared_tiny, tmp_path, factors, **settings)
     trainer.train()
     light, found = trainer.model.appearance, {}

@@ -31,7 +31,7 @@ TINY: dict[str, dict[str, Any]] = {
     "vanilla-nerf": {**NETWORK, **TWO_PASSES},
     "vanilla-nerf+occupancy": {**NETWORK, **MARCHED, "sampler": "occupancy"},
     "mip-nerf": {**NETWORK, **TWO_PASSES, "position_frequencies": 8},
-    "nerf-w": {**GRID, **PROPOSED, "sampler": "proposal", "transient_resolution": 4},
+    "nerf-w": {**GRID, **PROPOSED, "sampler": "proposal"},
     "nerf-w+frequency": {**MARCHED, "encoding": "frequency", "sampler": "occupancy", "samples_per_batch": 2048},
     "mip-nerf-360": {**GRID, **PROPOSED, "encoding": "hash-grid", "lr_warmup_steps": 0},
     "mip-nerf-360+integrated": {

@@ -38,13 +38,13 @@ from nerfloom.viewer.camera_panel import CameraPanel
 from nerfloom.viewer.crop import CroppedCameras, picture_within
 from nerfloom.viewer.crop_panel import FACES, dragged, edges, middle, outward
 from nerfloom.viewer.markdown import plain
-from nerfloom.viewer.newer_checkpoint import newer_checkpoint, reloaded
 from nerfloom.viewer.occupancy import shown_cells
 from nerfloom.viewer.pace import Speed
 from nerfloom.viewer.photographs import THUMBNAIL, Photographs, small_picture
 from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.reports import curve, heading
 from nerfloom.viewer.request import Crop, Pose, Request
+from nerfloom.viewer.trained_viewer import newer_checkpoint, reloaded
 from tests.conftest import Refused
 from tests.training.helpers import tiny_run, tiny_trainer
 

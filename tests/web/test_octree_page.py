@@ -246,7 +246,7 @@ def test_the_page_of_a_run_of_voxels_is_its_octree(tmp_path: Path, capsys: pytes
     model.set_octree(octree.layout, raw_of(octree.leaves.depths())[:, None], coefficients)
     loaded = Loaded(model, octree.placement, "voxels", tmp_path / "x.ckpt", tmp_path / "x.ckpt")
     limit = (len(page(b"", octree_facts(UPRIGHT)).encode()) + 35_000) / 1e6
-    export_page(loaded, tmp_path / "x.html", WebSettings(max_megabytes=limit), load_method("gaussian-splatting"))
+    export_page(loaded, tmp_path / "x.html", WebSettings(max_megabytes=limit))
     said = capsys.readouterr().err
     assert "MB hold harmonics of degree 0 instead of 1\n" in said
     assert f"{octree.layout.num_leaves:,} leaves with harmonics of degree 0" in said

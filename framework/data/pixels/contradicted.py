@@ -36,6 +36,8 @@ MIN_DRAWS = 4
 ALL_UNTIL = 0.25
 """Fraction of the budget during which all pixels count, because errors are large everywhere until the scene is
 learnt."""
+FACTOR = 2.0
+"""A tile is contradicted if its squared mean error, or its score, is more than this many times the median."""
 LEAST = 0.07
 """Minimum mean error of a contradicted tile; colours are in [0, 1]."""
 STEPS_PER_LOOK = 25
@@ -52,12 +54,11 @@ class ContradictedTiles(LeftOutTiles):
 
     Args:
         dataset: M images.
-        factor: a tile is contradicted if its squared mean error is this many times the median.
     """
 
-    def __init__(self, dataset: Dataset, factor: float) -> None:
+    def __init__(self, dataset: Dataset) -> None:
         super().__init__(dataset, TILES_ALONG)
-        self.around, self.factor = self.tiles.neighbours(), factor
+        self.around = self.tiles.neighbours()
         self.state = torch.zeros(self.tiles.total, 5, device=dataset.device)
         """(T, 5) weighted sums of the signed errors of the three channels; sum of the weights; 1 if contradicted,
         otherwise 0."""
@@ -89,20 +90,19 @@ class ContradictedTiles(LeftOutTiles):
             return
         scores, known = self.scores()
         typical = torch.where(known, scores, torch.nan).nanmedian()
-        self.state[:, 4] = known & (scores > (self.factor * typical).clamp(min=LEAST**2))
+        self.state[:, 4] = known & (scores > (FACTOR * typical).clamp(min=LEAST**2))
 
 
 class ContradictedViews(LeftOutTiles):
-    """Tiles of whole images that are contradicted by the errors of the last drawing.
+    """Tiles of whole images that are contradicted by the errors of the last drawing, by the median of the image.
 
     Args:
         dataset: M images.
-        factor: a tile is contradicted if its score is this many times the median of its image.
     """
 
-    def __init__(self, dataset: Dataset, factor: float) -> None:
+    def __init__(self, dataset: Dataset) -> None:
         super().__init__(dataset, TILES_ALONG)
-        self.factor, self.state = factor, torch.zeros_like(self.state)
+        self.state = torch.zeros_like(self.state)
 
     def weights(self, index: int, progress: float) -> Tensor | None:
         """Return the weights (H, W) of the pixels of an image, which fall from 1 to 0 in contradicted tiles.
@@ -122,7 +122,7 @@ class ContradictedViews(LeftOutTiles):
         if progress < ALL_UNTIL:
             return
         scores = view_scores(errors, colors, self.tiles.side)
-        out = scores > (self.factor * scores.median()).clamp(min=LEAST**2)
+        out = scores > (FACTOR * scores.median()).clamp(min=LEAST**2)
         self.tiles.of_image(self.state, index).copy_(out)
 
 

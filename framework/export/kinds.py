@@ -139,10 +139,8 @@ def _occupancy() -> Writer:
 
 def _page() -> Writer:
     from nerfloom.export.run_page import export_page
-    from nerfloom.registry import load_method
 
-    splatting = load_method("gaussian-splatting")
-    return lambda loaded, path, settings, regions: export_page(loaded, path, settings, splatting, regions)
+    return export_page
 
 
 KINDS: dict[str, Kind] = {

@@ -112,12 +112,11 @@ class Tab:
         """Touch the page with one finger."""
         self.swipe(((x, y), (x, y)), steps=0)
 
-    def phone(self, width: int, height: int, address: str) -> None:
-        """Open a page as a phone does, which has a narrow screen and no mouse."""
+    def resize(self, width: int, height: int, is_phone: bool = False) -> None:
+        """Change the size of the page, pixels, and whether it is on a phone, which has fingers and no mouse."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1}
-        self.send("Emulation.setDeviceMetricsOverride", **size, mobile=True)
-        self.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
-        self.send("Page.navigate", url=address)
+        self.send("Emulation.setDeviceMetricsOverride", **size, mobile=is_phone)
+        self.send("Emulation.setTouchEmulationEnabled", enabled=is_phone, maxTouchPoints=2)
 
     def press(self, text: str) -> None:
         """Click the element with a text."""

@@ -103,9 +103,19 @@ def test_field_of_view_and_up(browser: Chromium, run: Path) -> None:
         tilted = shown(tab)
         assert decibels(tilted, expected(run, tab, [*look[:6], 1.0, 0.0, 0.0])) > 30
         assert decibels(tilted, first) < 25
+        tab.press("Path")
+        tab.press("Add this camera")
+        tab.press("View")
         choose(tab, "Up", "scene")
         time.sleep(1)
         assert decibels(shown(tab), first) > 35
+        for level in (lambda: tab.press("Level"), lambda: tab.key("l", "KeyL", 76)):
+            tab.press("Path")
+            tab.press("go to")
+            assert decibels(shown(tab), tilted) > 35
+            tab.press("View")
+            level()
+            assert decibels(shown(tab), first) > 35
         tab.close()
 
 
@@ -265,7 +275,8 @@ def test_keys(browser: Chromium, run: Path) -> None:
 def test_a_narrow_screen_and_a_finger(browser: Chromium, run: Path) -> None:
     with started(command("ns-viewer"), run, "--websocket-port", 18307) as (_, address):
         tab = browser.open("about:blank")
-        tab.phone(390, 780, address)
+        tab.resize(390, 780, is_phone=True)
+        tab.send("Page.navigate", url=address)
         until(lambda: "Field of view" in text_of(tab))
         before = settled(tab)[180:300, 60:330].astype(float)
         assert before.std() > 5

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 ROOM = "/photographs"
 """Name of the cameras in the scene."""
+COLOR = (60, 180, 90)
+"""Colour of the cameras, which is seen before light and dark scenes."""
 SIZE = 0.06
 """Size of a camera in the scene, as a fraction of the cameras' spread."""
 
@@ -57,7 +59,8 @@ class CameraPanel:
                 fov=self._photographs.fov(index),
                 aspect=float(cameras.widths[index]) / float(cameras.heights[index]),
                 scale=size,
-                thickness=1.0,
+                color=COLOR,
+                thickness=1.5,
                 thickness_units="screen",
                 wxyz=quaternion_of(pose),
                 position=pose[:, 3].tolist(),

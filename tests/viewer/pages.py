@@ -39,13 +39,13 @@ def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
         process.communicate(timeout=PATIENCE)
 
 
-def settled(tab: Tab, seconds: float = 180.0) -> np.ndarray:
-    """The page when it has stopped changing."""
+def settled(tab: Tab, seconds: float = 180.0, least: float = 5.0) -> np.ndarray:
+    """The page when it has stopped changing, and its grey levels deviate by more than `least`: it is not empty."""
     end, before = time.monotonic() + seconds, tab.screenshot()
     while time.monotonic() < end:
         time.sleep(1.5)
         now = tab.screenshot()
-        if np.array_equal(now, before) and now[150:500, 50:500].std() > 5:
+        if np.array_equal(now, before) and now[150:500, 50:500].std() > least:
             return now
         before = now
     raise AssertionError("the page did not come to rest")

@@ -28,6 +28,7 @@ from tests.viewer.pages import (
     expected,
     look_of,
     meets_box,
+    settled,
     shown,
     size_of,
     started,
@@ -99,14 +100,14 @@ def test_crop(browser: Chromium, run: Path) -> None:
         inside = meets_box(tab, look_of(run), low, [*high[:2], 0.0])
         type_into(tab, "Lowest corner", 2, "-0.001")
         time.sleep(1)
-        slice_left = (np.abs(shown(tab) - 255).max(-1) > 40).mean()
+        slice_left = (np.abs(settled(tab, least=-1)[PICTURE].astype(int) - 255).max(-1) > 40).mean()
         type_into(tab, "Lowest corner", 2, str(low[2]))
-        depths_left = []
-        for near, far in (("0", "2.9"), ("5.2", "9"), ("0", "9")):  # the ball is between 3 and 5
-            type_into(tab, "Near", 0, near)
-            type_into(tab, "Far", 0, far)
+        depths_left, away = [], float(np.linalg.norm(look_of(run)[:3]))
+        for near, far in ((0, 0.7), (1.3, 3), (0, 3)):  # the ball is between 0.75 and 1.25 of the camera's distance
+            type_into(tab, "Near", 0, f"{near * away:.2f}")
+            type_into(tab, "Far", 0, f"{far * away:.2f}")
             time.sleep(1)
-            depths_left.append((np.abs(tab.screenshot()[PICTURE].astype(int) - 255).max(-1) > 40).mean())
+            depths_left.append((np.abs(settled(tab, least=-1)[PICTURE].astype(int) - 255).max(-1) > 40).mean())
         tab.close()
     # JPEG's blocks of 8 pixels carry errors across the edge of the box.
     near_edge = binary_dilation(inside, iterations=9) & ~binary_erosion(inside, iterations=9)

@@ -125,7 +125,7 @@ def test_a_photograph_lies_over_the_picture(browser: Chromium, run: Path, shared
     with started(command("ns-viewer"), run, "--websocket-port", 17807) as (_, address):
         tab = browser.open(address)
         shown(tab)
-        tab.press("Photographs")
+        tab.press("Photos")
         tab.press("Go to the photograph")
         time.sleep(1)
         tab.press("View")
@@ -190,7 +190,7 @@ def test_floaters_are_counted_and_are_red_points(browser: Chromium, tmp_path: Pa
     with started(command("ns-viewer"), *words) as (_, address):
         tab = browser.open(address)
         shown(tab)
-        tab.press("Photographs")
+        tab.press("Photos")
         type_into(tab, "Photograph", 0, str(number))
         tab.press("Go to the photograph")
         until(lambda: "004.png" in text_of(tab))
@@ -286,6 +286,10 @@ def test_a_narrow_screen_and_a_finger(browser: Chromium, run: Path) -> None:
           return box.left >= 0 && box.right <= window.innerWidth;
         })"""
         assert tab.evaluate(inside)
+        rows = "new Set([...document.querySelectorAll('[role=tab]')].map(tab => tab.getBoundingClientRect().top)).size"
+        assert tab.evaluate(rows) == 1
         tab.swipe(((120, 240), (260, 230)))
         assert decibels(settled(tab)[180:300, 60:330], before) < 25  # the finger has turned the camera
+        tab.press("nerfloom")
+        until(lambda: "Field of view" not in text_of(tab))  # the sheet is folded, and the picture is free
         tab.close()

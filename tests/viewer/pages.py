@@ -137,8 +137,9 @@ def type_into(tab: Tab, label: str, index: int, text: str) -> None:
 def type_text(tab: Tab, label: str, text: str) -> None:
     """Replace the text beside a label."""
     script = f"""(() => {{
-      const found = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)});
-      const field = found[0].parentElement.parentElement.querySelector("input");
+      let row = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)})[0];
+      while (!row.querySelector("input")) row = row.parentElement;
+      const field = row.querySelector("input");
       field.scrollIntoView({{block: "center"}});
       field.focus();
       field.select();

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.photographs import Photographs
@@ -14,6 +16,8 @@ if TYPE_CHECKING:
 
 ROOM = "/photographs"
 """Name of the cameras in the scene."""
+COLOR = (60, 180, 90)
+"""Colour of the cameras, which is seen before light and dark scenes."""
 SIZE = 0.06
 """Size of a camera in the scene, as a fraction of the cameras' spread."""
 
@@ -24,6 +28,7 @@ class CameraPanel:
     def __init__(self, client: viser.ClientHandle, photographs: Photographs, move: Move) -> None:
         self._client, self._photographs, self._move = client, photographs, move
         self._generation = 0
+        self._frusta: dict[int, Any] = {}
         self._shown = client.gui.add_checkbox(
             "Show cameras", False, hint="Cameras of the training images; click on one to go there."
         )
@@ -39,6 +44,7 @@ class CameraPanel:
         """Add or remove the cameras; their thumbnails follow one by one."""
         self._generation += 1
         generation = self._generation
+        self._frusta = {}
         if self._shown.value is not True:
             self._client.scene.remove_by_name(ROOM)
             return
@@ -49,7 +55,7 @@ class CameraPanel:
         self._client.scene.add_frame(ROOM, show_axes=False)
         places = cameras.camera_to_worlds[:, :, 3]
         size = SIZE * (float((places - places.mean(0)).norm(dim=-1).max()) or 1.0)
-        handles = {}
+        handles: dict[int, Any] = {}
         for index in chosen:
             pose = cameras.camera_to_worlds[index]
             handles[index] = self._client.scene.add_camera_frustum(
@@ -57,18 +63,26 @@ class CameraPanel:
                 fov=self._photographs.fov(index),
                 aspect=float(cameras.widths[index]) / float(cameras.heights[index]),
                 scale=size,
-                thickness=1.0,
+                color=COLOR,
+                thickness=1.5,
                 thickness_units="screen",
                 wxyz=quaternion_of(pose),
                 position=pose[:, 3].tolist(),
             )
             handles[index].on_click(lambda _, index=index: self.visit(index))
+        self._frusta = handles
+        self._uncover(self._client.camera.position)
         self._note.content = f"{len(chosen)} of {len(cameras)} cameras"
         for index, handle in handles.items():
             if generation != self._generation:  # cameras hidden meanwhile, or browser gone
                 return
             if (small := self._photographs.thumbnail(index)) is not None:
                 handle.image = small
+
+    def _uncover(self, place: Iterable[float]) -> None:
+        """Hide the cameras at the `place` of the browser's camera: their thumbnails would cover its picture."""
+        for frustum in self._frusta.values():
+            frustum.visible = math.dist(frustum.position, place) > frustum.scale
 
     def close(self) -> None:
         """Stop reading thumbnails when the browser has left."""
@@ -93,4 +107,5 @@ class CameraPanel:
         self._number.value = index
         photographs = self._photographs
         self._move(photographs.pose(index), photographs.fov(index), photographs.time(index))
+        self._uncover(photographs.pose(index)[:, 3].tolist())
         self._note.content = f"photograph {index}: {plain(photographs.name(index))}"

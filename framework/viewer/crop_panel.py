@@ -59,8 +59,9 @@ class CropPanel:
             self._boxed = gui.add_checkbox("Show the box", True, hint="Drag the arrows at its faces.")
             self._low = gui.add_vector3("Lowest corner", low, step=step)
             self._high = gui.add_vector3("Highest corner", high, step=step)
-            self._near = gui.add_number("Near", 0.0, min=0.0, step=step, hint="Distance from the camera, scene units")
-            self._far = gui.add_number("Far", round(float(model.scene.far), 3), min=0.0, step=step)
+            hint = "Distance from the camera, scene units."
+            self._near = gui.add_number("Near", 0.0, min=0.0, step=step, hint=hint)
+            self._far = gui.add_number("Far", round(float(model.scene.far), 3), min=0.0, step=step, hint=hint)
             gui.add_button("Save the box", hint=f"{FILE} in the folder of the run.").on_click(lambda _: self._save())
             self._note = gui.add_markdown("")
         for handle in (self._cropping, self._boxed):

@@ -102,7 +102,7 @@ class Page:
             panel.show_time(time)
 
         if queue.loaded.source is not None:
-            with tabs.add_tab("Photographs"):
+            with tabs.add_tab("Photos"):
                 cameras = CameraPanel(client, self._photographs, move)
                 if can_find(queue.loaded):
                     FloaterPanel(client, queue, panel.request)

@@ -66,8 +66,8 @@ class PathPanel:
             handle.on_update(lambda _: self._edit(lambda editor: editor))
         self._preview = gui.add_button("Preview")
         self._preview.on_click(lambda _: self._play())
-        self._width = gui.add_number("Width", 1280, min=16, max=8192, step=2)
-        self._height = gui.add_number("Height", 720, min=16, max=8192, step=2)
+        self._width = gui.add_number("Width", 1280, min=16, max=8192, step=2, hint="Of the video, pixels.")
+        self._height = gui.add_number("Height", 720, min=16, max=8192, step=2, hint="Of the video, pixels.")
         self._name = gui.add_text("Name", "", hint="Letters, digits, - and _; camera_path.json if empty")
         gui.add_button("Save").on_click(lambda _: self._save())
         self._note = gui.add_markdown("")
@@ -122,7 +122,7 @@ class PathPanel:
             self._chosen.value = str(count) if count else NOTHING
         path = self._path()
         seconds = 0.0 if path is None else path.seconds
-        self._note.content = f"{count} cameras, {seconds:.1f} s"
+        self._note.content = f"{count} camera{'' if count == 1 else 's'}, {seconds:.1f} s"
         self._show(path)
 
     def _path(self) -> CameraPath | None:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import imageio.v3 as iio
 import numpy as np
@@ -28,6 +29,14 @@ FLAGS = (
     *("--remote-debugging-port=0", "--remote-allow-origins=*", "--disable-background-timer-throttling"),
     *("--disable-renderer-backgrounding", "--disable-backgrounding-occluded-windows"),
 )
+Place = tuple[float, float]
+"""Column and row of a page, pixels."""
+
+
+def between(start: Place, end: Place, steps: int) -> list[Place]:
+    """Places on a line, the last one at its end."""
+    (x0, y0), (x1, y1) = start, end
+    return [(x0 + (x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps) for k in range(1, steps + 1)]
 
 
 class Tab:
@@ -67,14 +76,16 @@ class Tab:
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
-    def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8, pause: float = 0.03) -> None:
+    def drag(self, start: Place, end: Place, steps: int = 8, button: str = "left", modifiers: int = 0) -> None:
+        """Drag with a button of the mouse; the modifier 8 is Shift."""
+        held = {"button": button, "modifiers": modifiers}
+        buttons = {"left": 1, "right": 2}[button]
         self.mouse("mouseMoved", *start)
-        self.mouse("mousePressed", *start, button="left", buttons=1, clickCount=1)
-        for step in range(1, steps + 1):
-            x, y = (a + (b - a) * step / steps for a, b in zip(start, end, strict=True))
-            self.mouse("mouseMoved", x, y, button="left", buttons=1)
-            time.sleep(pause)
-        self.mouse("mouseReleased", *end, button="left", buttons=0, clickCount=1)
+        self.mouse("mousePressed", *start, buttons=buttons, clickCount=1, **held)
+        for x, y in between(start, end, steps):
+            self.mouse("mouseMoved", x, y, buttons=buttons, **held)
+            time.sleep(0.03)
+        self.mouse("mouseReleased", *end, buttons=0, clickCount=1, **held)
 
     def click(self, x: float, y: float) -> None:
         self.mouse("mouseMoved", x, y)
@@ -87,21 +98,25 @@ class Tab:
             self.send("Input.dispatchKeyEvent", type=kind, key=key, code=code, windowsVirtualKeyCode=number)
             time.sleep(pause)
 
-    def swipe(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
-        """Draw one finger over the page."""
-        for step in range(steps + 1):
-            x, y = (a + (b - a) * step / steps for a, b in zip(start, end, strict=True))
-            kind = "touchMove" if step else "touchStart"
-            self.send("Input.dispatchTouchEvent", type=kind, touchPoints=[{"x": x, "y": y}])
+    def swipe(self, *fingers: tuple[Place, Place], steps: int = 8) -> None:
+        """Draw fingers over the page, each from its start to its end."""
+        kind = "touchStart"
+        for places in zip(*([start, *between(start, end, steps)] for start, end in fingers), strict=True):
+            points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(places)]
+            self.send("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+            kind = "touchMove"
             time.sleep(0.03)
         self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
-    def phone(self, width: int, height: int, address: str) -> None:
-        """Open a page as a phone does, which has a narrow screen and no mouse."""
+    def tap(self, x: float, y: float) -> None:
+        """Touch the page with one finger."""
+        self.swipe(((x, y), (x, y)), steps=0)
+
+    def resize(self, width: int, height: int, is_phone: bool = False) -> None:
+        """Change the size of the page, pixels, and whether it is on a phone, which has fingers and no mouse."""
         size = {"width": width, "height": height, "deviceScaleFactor": 1}
-        self.send("Emulation.setDeviceMetricsOverride", **size, mobile=True)
-        self.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
-        self.send("Page.navigate", url=address)
+        self.send("Emulation.setDeviceMetricsOverride", **size, mobile=is_phone)
+        self.send("Emulation.setTouchEmulationEnabled", enabled=is_phone, maxTouchPoints=2)
 
     def press(self, text: str) -> None:
         """Click the element with a text."""
@@ -136,7 +151,7 @@ class Chromium:
         self.port = int(until(lambda: file.is_file() and file.read_text().split("\n")[0]))
 
     def open(self, address: str) -> Tab:
-        request = urllib.request.Request(f"http://127.0.0.1:{self.port}/json/new?{address}", method="PUT")
+        request = urllib.request.Request(f"http://127.0.0.1:{self.port}/json/new?{quote(address)}", method="PUT")
         with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
             target = json.load(answer)
         return Tab(target["webSocketDebuggerUrl"], target["id"], self.port)

@@ -39,13 +39,13 @@ def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
         process.communicate(timeout=PATIENCE)
 
 
-def settled(tab: Tab, seconds: float = 180.0) -> np.ndarray:
-    """The page when it has stopped changing."""
+def settled(tab: Tab, seconds: float = 180.0, least: float = 5.0) -> np.ndarray:
+    """The page when it has stopped changing, and its grey levels deviate by more than `least`: it is not empty."""
     end, before = time.monotonic() + seconds, tab.screenshot()
     while time.monotonic() < end:
         time.sleep(1.5)
         now = tab.screenshot()
-        if np.array_equal(now, before) and now[150:500, 50:500].std() > 5:
+        if np.array_equal(now, before) and now[150:500, 50:500].std() > least:
             return now
         before = now
     raise AssertionError("the page did not come to rest")
@@ -67,17 +67,33 @@ def shown(tab: Tab) -> np.ndarray:
     return settled(tab)[PICTURE].astype(float)
 
 
-def expected(run: Path, tab: Tab, camera: list[float], time: float | None = None, fov: float = 50.0) -> np.ndarray:
-    """The run's model rendered from the page's camera: position, target and up."""
-    width, height = size_of(tab)
+def expected(
+    run: Path,
+    tab: Tab,
+    camera: list[float],
+    time: float | None = None,
+    fov: float = 50.0,
+    longest: int = 1024,
+    background: Sequence[float] | None = None,
+) -> np.ndarray:
+    """The run's model rendered from the page's camera: position, target and up.
+
+    Args:
+        longest: longer side of the rendered picture, which is then enlarged to the page's.
+        background: colour behind the scene; None for the evaluation background.
+    """
+    size = size_of(tab)
+    width, height = (round(side * min(longest / max(size), 1)) for side in size)
     position, target, up = (torch.tensor(camera[i : i + 3], dtype=torch.float64) for i in (0, 3, 6))
     back = torch.nn.functional.normalize(position - target, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=0)
     matrix = torch.stack([right, torch.linalg.cross(back, right), back, position], 1)
     model = load_trained(run, device_type="cpu").model
     request = Request(Pose(tuple(matrix.flatten().tolist()), np.radians(fov)), width, height, time=time)
-    picture = model.render_view(View(request.camera(), time=time), model.background)
-    return picture.rgb.clamp(0, 1).numpy()[PICTURE] * 255
+    behind = model.background if background is None else torch.tensor(background)
+    picture = model.render_view(View(request.camera(), time=time), behind).rgb.clamp(0, 1).permute(2, 0, 1)[None]
+    whole = torch.nn.functional.interpolate(picture, (size[1], size[0]), mode="bilinear")[0].permute(1, 2, 0)
+    return whole.numpy()[PICTURE] * 255
 
 
 def decibels(a: np.ndarray, b: np.ndarray) -> float:
@@ -116,6 +132,22 @@ def type_into(tab: Tab, label: str, index: int, text: str) -> None:
     }})()"""
     tab.evaluate(script)
     tab.send("Input.insertText", text=text)
+
+
+def type_text(tab: Tab, label: str, text: str) -> None:
+    """Replace the text beside a label."""
+    script = f"""(() => {{
+      let row = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)})[0];
+      while (!row.querySelector("input")) row = row.parentElement;
+      const field = row.querySelector("input");
+      field.scrollIntoView({{block: "center"}});
+      field.focus();
+      field.select();
+    }})()"""
+    tab.evaluate(script)
+    tab.send("Input.insertText", text=text)
+    tab.key("Enter", "Enter", 13)
+    time.sleep(1)
 
 
 def type_number(tab: Tab, label: str, text: str) -> None:
@@ -177,9 +209,9 @@ def meets_box(tab: Tab, camera: list[float], low: Sequence[float], high: Sequenc
     return (leave > np.maximum(enter, 0))[PICTURE]
 
 
-def look_of(run: Path) -> list[float]:
-    """The camera that the page begins with: position, target and up."""
+def look_of(run: Path, index: int = 0) -> list[float]:
+    """The camera of a photograph, that of the first one is the page's own: position, target and up."""
     camera = load_trained(run, device_type="cpu").model.scene.camera_to_worlds
     assert camera is not None
-    position, back = camera[0, :, 3], camera[0, :, 2]
+    position, back = camera[index, :, 3], camera[index, :, 2]
     return [*position.tolist(), *(position - back).tolist(), 0.0, 0.0, 1.0]

@@ -28,6 +28,7 @@ from tests.viewer.pages import (
     expected,
     look_of,
     meets_box,
+    settled,
     shown,
     size_of,
     started,
@@ -35,6 +36,7 @@ from tests.viewer.pages import (
     tick,
     to_the_end,
     type_into,
+    type_text,
 )
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
@@ -84,7 +86,7 @@ def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
 
 
 def test_crop(browser: Chromium, run: Path) -> None:
-    """The outside of the box is gone from the page, and the inside is unchanged."""
+    """The outside of the box is gone from the page, and the inside is unchanged; so is what is too near or too far."""
     with started(command("ns-viewer"), run, "--websocket-port", 17407) as (_, address):
         tab = browser.open(address)
         whole = shown(tab)
@@ -96,6 +98,16 @@ def test_crop(browser: Chromium, run: Path) -> None:
         cut = shown(tab)
         low, high = load_trained(run, device_type="cpu").model.scene.box.double().tolist()
         inside = meets_box(tab, look_of(run), low, [*high[:2], 0.0])
+        type_into(tab, "Lowest corner", 2, "-0.001")
+        time.sleep(1)
+        slice_left = (np.abs(settled(tab, least=-1)[PICTURE].astype(int) - 255).max(-1) > 40).mean()
+        type_into(tab, "Lowest corner", 2, str(low[2]))
+        depths_left, away = [], float(np.linalg.norm(look_of(run)[:3]))
+        for near, far in ((0, 0.7), (1.3, 3), (0, 3)):  # the ball is between 0.75 and 1.25 of the camera's distance
+            type_into(tab, "Near", 0, f"{near * away:.2f}")
+            type_into(tab, "Far", 0, f"{far * away:.2f}")
+            time.sleep(1)
+            depths_left.append((np.abs(settled(tab, least=-1)[PICTURE].astype(int) - 255).max(-1) > 40).mean())
         tab.close()
     # JPEG's blocks of 8 pixels carry errors across the edge of the box.
     near_edge = binary_dilation(inside, iterations=9) & ~binary_erosion(inside, iterations=9)
@@ -106,6 +118,10 @@ def test_crop(browser: Chromium, run: Path) -> None:
     assert matter[outside].mean() > 0.1
     assert left[outside].mean() == 0
     assert left[inside].mean() > 0.1
+    print(f"left of a thin slice: {slice_left:.4f} of {left.mean():.3f}, by depths: {depths_left}")
+    assert slice_left < 0.2 * left.mean()
+    assert max(depths_left[:2]) < 0.01
+    assert depths_left[2] == pytest.approx(left.mean(), rel=0.05)
 
 
 def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
@@ -127,12 +143,14 @@ def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
         picture = tab.screenshot(tmp_path / "measure.png")
         tab.press("Set the scale")
         time.sleep(1)
+        type_into(tab, "True length", 0, "20")
+        type_text(tab, "Unit", "cm")
         tab.press("Set scale")
         file = run / "scale.json"
         until(file.is_file)
         scale = json.loads(file.read_text())
         file.unlink()
-        scaled = until(lambda: re.search(r"\b1(\.0+)? m (±|\()", text_of(tab)))
+        scaled = until(lambda: re.search(r"\b20(\.0+)? cm (±|\()", text_of(tab)))
         tab.screenshot(tmp_path / "scaled.png")
         tab.close()
     loaded = load(run, device="cpu")
@@ -146,8 +164,8 @@ def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
     expected = loaded.measure(*ends)
     print(f"on the page: {found[0]}; in Python: {expected}; with the scale: {scaled[0]}")
     assert float(found[1]) == pytest.approx(expected.value, rel=0.02)  # the page's pixels are not the window's
-    assert scale["unit"] == "m"
-    assert scale["factor"] == pytest.approx(1 / expected.value, rel=0.02)
+    assert scale["unit"] == "cm"
+    assert scale["factor"] == pytest.approx(20 / expected.value, rel=0.02)
     assert int((np.abs(picture[PICTURE].astype(int) - [255, 190, 0]).max(-1) < 60).sum()) > 100  # the line is drawn
 
 

@@ -103,9 +103,19 @@ def test_field_of_view_and_up(browser: Chromium, run: Path) -> None:
         tilted = shown(tab)
         assert decibels(tilted, expected(run, tab, [*look[:6], 1.0, 0.0, 0.0])) > 30
         assert decibels(tilted, first) < 25
+        tab.press("Path")
+        tab.press("Add this camera")
+        tab.press("View")
         choose(tab, "Up", "scene")
         time.sleep(1)
         assert decibels(shown(tab), first) > 35
+        for level in (lambda: tab.press("Level"), lambda: tab.key("l", "KeyL", 76)):
+            tab.press("Path")
+            tab.press("go to")
+            assert decibels(shown(tab), tilted) > 35
+            tab.press("View")
+            level()
+            assert decibels(shown(tab), first) > 35
         tab.close()
 
 
@@ -115,7 +125,7 @@ def test_a_photograph_lies_over_the_picture(browser: Chromium, run: Path, shared
     with started(command("ns-viewer"), run, "--websocket-port", 17807) as (_, address):
         tab = browser.open(address)
         shown(tab)
-        tab.press("Photographs")
+        tab.press("Photos")
         tab.press("Go to the photograph")
         time.sleep(1)
         tab.press("View")
@@ -180,7 +190,7 @@ def test_floaters_are_counted_and_are_red_points(browser: Chromium, tmp_path: Pa
     with started(command("ns-viewer"), *words) as (_, address):
         tab = browser.open(address)
         shown(tab)
-        tab.press("Photographs")
+        tab.press("Photos")
         type_into(tab, "Photograph", 0, str(number))
         tab.press("Go to the photograph")
         until(lambda: "004.png" in text_of(tab))
@@ -265,7 +275,8 @@ def test_keys(browser: Chromium, run: Path) -> None:
 def test_a_narrow_screen_and_a_finger(browser: Chromium, run: Path) -> None:
     with started(command("ns-viewer"), run, "--websocket-port", 18307) as (_, address):
         tab = browser.open("about:blank")
-        tab.phone(390, 780, address)
+        tab.resize(390, 780, is_phone=True)
+        tab.send("Page.navigate", url=address)
         until(lambda: "Field of view" in text_of(tab))
         before = settled(tab)[180:300, 60:330].astype(float)
         assert before.std() > 5
@@ -275,6 +286,8 @@ def test_a_narrow_screen_and_a_finger(browser: Chromium, run: Path) -> None:
           return box.left >= 0 && box.right <= window.innerWidth;
         })"""
         assert tab.evaluate(inside)
-        tab.swipe((120, 240), (260, 230))
+        tab.swipe(((120, 240), (260, 230)))
         assert decibels(settled(tab)[180:300, 60:330], before) < 25  # the finger has turned the camera
+        tab.press("nerfloom")
+        until(lambda: "Field of view" not in text_of(tab))  # the sheet is folded, and the picture is free
         tab.close()

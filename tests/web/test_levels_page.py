@@ -33,8 +33,10 @@ from nerfloom.splats.transform import transformed
 from tests.cli.helpers import called
 from tests.conftest import Refused
 from tests.levels.made import built, cloud, leaves, scene
+from tests.patience import until
+from tests.viewer.chromium import Chromium
 from tests.web.helpers import SIZE, some_cameras, some_facts
-from tests.web.test_browser import message_in, opened, pictured
+from tests.web.test_browser import message_in, opened
 
 UPRIGHT = torch.eye(3, dtype=torch.float64)
 
@@ -157,21 +159,26 @@ def page(file: LevelsFile, tmp_path: Path) -> tuple[Path, DrawnLevels]:
     return path, exported(file, path)
 
 
+def complete(live: Chromium, address: str) -> torch.Tensor:
+    """The browser's picture from camera 1, (H, W, 3), when all chunks of its cut are there."""
+    tab = live.open(f"{address}#camera=1&plain=1&sort=here")
+    until(lambda: tab.evaluate("document.documentElement.dataset.missing") == "0")
+    tab.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    width, height = SIZE
+    shot = torch.from_numpy(tab.screenshot()[:height, :width].copy()).float() / 255
+    tab.close()
+    return shot
+
+
 @pytest.mark.slow
-def test_the_browser_loads_and_draws_the_levels_that_we_draw(
-    browser: str, page: tuple[Path, DrawnLevels], tmp_path: Path
-) -> None:
+def test_the_browser_loads_and_draws_the_levels_that_we_draw(live: Chromium, page: tuple[Path, DrawnLevels]) -> None:
     """The colours that SPZ rounds are not the coarsest level's."""
     path, model = page
     own = model.render_rgb(View(some_cameras()[1:2]), torch.ones(3)).clamp(0, 1)
     assert float(own.std()) > 0.05  # there is something to see
     assert len(model.cut(View(some_cameras()[1:2])).nodes) > 1
     with hosted(path.parent) as host:
-        address = f"{host}/scene.html"
-        dom = opened(browser, tmp_path, f"{address}#camera=1&plain=1", "--dump-dom")
-        shot = pictured(browser, SimpleNamespace(as_uri=lambda: address), tmp_path, 1)  # type: ignore[arg-type]
-    assert 'data-missing="0"' in dom, dom[:300]
-    assert shot.shape == (SIZE[1], SIZE[0], 3)
+        shot = complete(live, f"{host}/scene.html")
     camera = splat_camera(some_cameras()[1:2], 0.05)
     coarsest = draw_colors(model.file.read(len(model.file.nodes) - 1), camera, 1, torch.ones(3)).clamp(0, 1)
     found, coarse = psnr(shot, own), psnr(coarsest, own)
@@ -190,7 +197,9 @@ def test_from_disk_the_coarsest_level_is_shown_and_why(
 
 
 @pytest.mark.slow
-def test_chunks_of_another_export_are_not_drawn(browser: str, page: tuple[Path, DrawnLevels], tmp_path: Path) -> None:
+def test_chunks_of_another_export_are_not_drawn(
+    browser: str, live: Chromium, page: tuple[Path, DrawnLevels], tmp_path: Path
+) -> None:
     """The browser keeps chunks of an earlier export, which look fresh for a long time; or the host has wrong ones."""
     path, _ = page
     folder, view = path.with_suffix(""), View(some_cameras()[1:2])
@@ -203,10 +212,10 @@ def test_chunks_of_another_export_are_not_drawn(browser: str, page: tuple[Path, 
     with hosted(path.parent) as host:
         address = f"{host}/scene.html"
         aged(10**9)
-        first = pictured(browser, SimpleNamespace(as_uri=lambda: address), tmp_path, 1)  # type: ignore[arg-type]
+        first = complete(live, address)
         model = exported(built(tmp_path / "other.levels", other, 300, memory=2.0), path)
         aged(10**9 + 60)
-        shot = pictured(browser, SimpleNamespace(as_uri=lambda: address), tmp_path, 1)  # type: ignore[arg-type]
+        shot = complete(live, address)
         fewer = encoded(other[:7], BITS, OURS)
         for chunk in folder.iterdir():
             chunk.write_bytes(fewer)

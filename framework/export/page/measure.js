@@ -77,7 +77,7 @@ function ruler(facts) {
       if (!shown || places.length < 2) return;
       const [[x1, y1], [x2, y2]] = places;
       set(line, { x1, y1, x2, y2 });
-      set(label, { x: (x1 + x2) / 2, y: (y1 + y2) / 2 - 10 });
+      set(label, { x: (x1 + x2) / 2, y: Math.min(y1, y2) - 14 }); // above both ends
       label.textContent = text;
     },
   };

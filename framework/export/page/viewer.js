@@ -317,7 +317,7 @@ function show(gl, scene, facts) {
   const help = (on = element("help").hidden) => {
     element("help").hidden = !on;
     element("ask").setAttribute("aria-expanded", on);
-    (on ? element("close") : canvas).focus();
+    (on ? element("close") : canvas).focus({ preventScroll: true }); // its beginning is shown
   };
   const bare = () => document.body.classList.toggle("bare");
   const ACTIONS = {

@@ -92,7 +92,7 @@ def test_no_more_rays_are_drawn_than_points_are_missing(
         places = torch.rand(-(-count // end_on_a_surface), 3)
         yield SurfacePoints(places, places, None, places, torch.zeros(len(places), dtype=torch.long))
 
-    monkeypatch.setattr("nerfloom.export.surfaces.surface_points", shown)
+    monkeypatch.setattr("nerfloom.export.points.surface_points", shown)
     trainer = tiny_trainer("gaussian-splatting", shared_tiny, tmp_path, start="random", num_gaussians=100)
     found = found_surfaces(load_method("instant-ngp"), trainer.train_set, trainer.config, 2, 60.0, 300)
     assert len(found.positions) == 300

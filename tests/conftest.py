@@ -20,12 +20,17 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 from tests.forked import Forks
 
 # Processes of tests share the cores (pytest -n auto), and small tensors gain nothing by a second thread. Tests that are
 # about threads ask for them.
 torch.set_num_threads(1)
+
+# Hypothesis looks at a clock twice, and a busy machine would fail its tests.
+settings.register_profile("without a clock", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("without a clock")
 
 
 def pytest_configure() -> None:

@@ -22,7 +22,7 @@ SIZE = float((BOX[1] - BOX[0]).norm()) / STEPS
 ROOMY = (4096, 8192)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(st.integers(0, 9), min_size=1, max_size=12), st.integers(1, 60))
 def test_slots_are_shared_out(counts: list[int], capacity: int) -> None:
     slots = share_out(torch.tensor(counts), capacity)

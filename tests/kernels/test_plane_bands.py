@@ -41,7 +41,7 @@ def truth(table: Tensor, layout: PlanesLayout, bands: list[Band], weight: Tensor
     return found.detach(), leaf.grad
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     sides=st.tuples(*[st.integers(2, 40)] * 3),
     features=st.sampled_from([1, 2, 3, 4, 16, 32]),

@@ -20,8 +20,8 @@ MARKS = {COMPILED: (needs_kernels,)}
 FEW = settings(
     max_examples=40,
     derandomize=True,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],  # a backend is switched to once for all examples
+    # A backend is switched to once for all examples.
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 """The same few examples in every run."""
 

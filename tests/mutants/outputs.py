@@ -101,7 +101,7 @@ MUTANTS = {
             "test_triangulation.py::test_the_covariance_is_that_of_least_squares"),
     ],
     "nerfloom.base.evenly_spaced": [
-        Mutant("spread-first-views", "spread", "[index * total // limit for index in A]", "list(A)",
+        Mutant("spread-first-views", "strided", "[index * total // limit for index in A]", "list(A)",
             "--max-images judges the first views alone",
             "evaluation/test_evaluator.py::test_pictures_are_of_views_evenly_spaced_and_of_the_worst"),
     ],

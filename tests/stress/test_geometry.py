@@ -141,8 +141,8 @@ def test_distance_has_a_slope_everywhere(dtype: torch.dtype) -> None:
 
 @pytest.mark.entry(15)
 def test_srgb_curves_have_a_slope_and_a_value_at_black() -> None:
-    """Colours are as stored; numpy has curves for the light of photographs and for glTF files, without a gradient."""
-    assert mentioned(r"\*\* *2\.4\b") == ["color.py", "gltf.py", "light_spread.py"]
+    """Colours are as stored; numpy has a curve for the light of photographs, without a gradient."""
+    assert mentioned(r"\*\* *2\.4\b") == ["color.py", "light_spread.py"]
     for curve, linear in ((to_srgb, 12.92), (to_linear, 1 / 12.92)):
         x = torch.tensor([0.0, 1e-30, 1e-4, 0.5, 1.0], requires_grad=True)
         (slope,) = torch.autograd.grad(curve(x).sum(), x)

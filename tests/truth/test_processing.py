@@ -135,6 +135,7 @@ def test_polycam(crop: int, tmp_path: Path) -> None:
     )
     assert (content["w"], content["h"]) == (WIDTH - 2 * crop, HEIGHT - 2 * crop)
     assert len(content["frames"]) == COUNT
+    assert (np.array(content["applied_transform"])[:, :3] @ [0, 1, 0]).tolist() == [0, 0, 1]  # y becomes z
     assert_pixels_show_the_ball(EVERY.parse(tmp_path / "out", "train"), None)
 
 

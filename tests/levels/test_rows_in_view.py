@@ -68,6 +68,19 @@ def test_all_that_is_drawn_is_among_them_before_and_after_a_step(number: int) ->
         columns["log_scales"].values.data[found] += 1.0
 
 
+def test_what_a_step_moves_before_another_camera_is_among_its_rows() -> None:
+    columns, rows = columns_of(sorted_cloud()), RowsInView(Tables(), 1e9, 64)
+    away, ahead = camera(3.0, turn=torch.pi), camera(0.2, turn=0.7)
+    found = rows.of(columns, ONE, splat_camera(ahead, 0.01), tangents(ahead, 0.3), learns=True)
+    pose = away.camera_to_worlds[0]
+    columns["means"].values.data[found] = pose[:, 3] - 2 * pose[:, 2]  # right before the camera that saw none
+    drawn = splat_camera(away, 0.01)
+    shown = RASTERISER.project(as_gaussians(columns), drawn).records[:, Record.CUT] > 0
+    assert bool(shown[found].any())
+    seen = rows.of(columns, ONE, drawn, tangents(away, 0.3), learns=True)
+    assert bool(torch.isin(shown.nonzero()[:, 0], seen).all())
+
+
 def test_what_is_behind_the_camera_is_not_among_them() -> None:
     columns, rows = columns_of(sorted_cloud()), RowsInView(Tables(), 1e9, 64)
     away, ahead = camera(3.0, turn=torch.pi), camera(0.2, turn=0.7)

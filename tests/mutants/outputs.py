@@ -48,7 +48,7 @@ MUTANTS = {
     "nerfloom.levels.rows_in_view": [
         Mutant("boxes-stand-still", "RowsInView.of", "self._stale |= seen", "pass",
             "Gaussians that a step has moved into an image are not drawn with a memory limit",
-            "levels/test_rows_in_view.py::test_all_that_is_drawn_is_among_them_before_and_after_a_step"),
+            "levels/test_rows_in_view.py::test_what_a_step_moves_before_another_camera_is_among_its_rows"),
     ],
     "nerfloom.blocks.merge": [
         Mutant("doubled-borders", "of_cell", "part[in_cell(A, B, C)]", "part",

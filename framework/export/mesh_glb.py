@@ -3,7 +3,7 @@
 Colours of photographs contain the light of their scene, so coloured meshes have KHR_materials_unlit: programs show the
 colours as they are. Programs without it light a matt surface. Colours of vertices are linear light, as glTF demands, in
 float32, because 8 bits of linear light are too coarse in the dark. Images are sRGB. They are read without smaller
-copies (mipmaps), in which the colours of triangles would mix.
+copies (mipmaps), because these would mix the colours of triangles.
 """
 
 from __future__ import annotations

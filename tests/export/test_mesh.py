@@ -150,7 +150,7 @@ def test_colours_in_glb_files_are_not_lit_again(part: str, tmp_path: Path) -> No
         u, v = texture.coordinates.reshape(-1, 2).T.numpy()
         np.testing.assert_allclose(attributes["TEXCOORD_0"], np.stack([u, 1 - v], -1), rtol=0, atol=1e-7)
         (sampler,) = described["samplers"]
-        assert sampler["minFilter"] == 9729  # without mipmaps, in which triangles mix
+        assert sampler["minFilter"] == 9729  # without mipmaps, which mix triangles
 
 
 @pytest.mark.parametrize(("kind", "center"), [("ply", (2, 0, 0)), ("obj", (2, 0, 0)), ("glb", (0, 2, 0))])

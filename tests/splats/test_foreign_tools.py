@@ -1,6 +1,6 @@
 """Files against other programs: they read what we write, and we read what they write.
 
-`NERFLOOM_NODE_TOOLS` names a folder in which npm has installed `PACKAGES`; Node 20 runs them. `pytest -s` shows the
+`NERFLOOM_NODE_TOOLS` names the folder where npm has installed `PACKAGES`; Node 20 runs them. `pytest -s` shows the
 largest differences, and docs/notes/splatting.md has them.
 """
 

@@ -136,33 +136,29 @@ def type_into(tab: Tab, label: str, index: int, text: str) -> None:
 
 def type_text(tab: Tab, label: str, text: str) -> None:
     """Replace the text beside a label."""
-    script = f"""(() => {{
-      let row = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)})[0];
-      while (!row.querySelector("input")) row = row.parentElement;
-      const field = row.querySelector("input");
-      field.scrollIntoView({{block: "center"}});
-      field.focus();
-      field.select();
-    }})()"""
-    tab.evaluate(script)
-    tab.send("Input.insertText", text=text)
+    _type_beside(tab, label, "input", "input", text)
     tab.key("Enter", "Enter", 13)
     time.sleep(1)
 
 
 def type_number(tab: Tab, label: str, text: str) -> None:
     """Replace the number beside a slider."""
+    _type_beside(tab, label, "[role=slider]", "input:not([type=hidden])", text)
+    time.sleep(1)
+
+
+def _type_beside(tab: Tab, label: str, part: str, field: str, text: str) -> None:
+    """Replace the text of a field in the row of a label; the row is the label's nearest ancestor with a part."""
     script = f"""(() => {{
       let row = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)})[0];
-      while (!row.querySelector("[role=slider]")) row = row.parentElement;
-      const field = row.querySelector("input:not([type=hidden])");
+      while (!row.querySelector({json.dumps(part)})) row = row.parentElement;
+      const field = row.querySelector({json.dumps(field)});
       field.scrollIntoView({{block: "center"}});
       field.focus();
       field.select();
     }})()"""
     tab.evaluate(script)
     tab.send("Input.insertText", text=text)
-    time.sleep(1)
 
 
 def tick(tab: Tab, label: str) -> None:

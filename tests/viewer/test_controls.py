@@ -85,7 +85,7 @@ def test_photographs(browser: Chromium, run: Path) -> None:
     with started(command("ns-viewer"), run, "--websocket-port", 18607) as (_, address):
         tab = browser.open(address)
         shown(tab)
-        choose(tab, "Output", "depth")  # in which no photograph hides
+        choose(tab, "Output", "depth")  # a photograph would not hide in it
         first = settled(tab)[:, 320:560].astype(int)
         tab.press("Photos")
         tick(tab, "Show cameras")

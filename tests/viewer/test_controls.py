@@ -113,6 +113,7 @@ def test_photographs(browser: Chromium, run: Path) -> None:
 def go_to_photograph(tab: Tab, index: int) -> None:
     tab.press("Photos")
     type_into(tab, "Photograph", 0, str(index))
+    time.sleep(1)  # the page sends a number a moment after it was typed
     tab.press("Go to the photograph")
     until(lambda: f"photograph {index}: " in text_of(tab))
     time.sleep(1)

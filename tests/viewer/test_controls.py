@@ -207,7 +207,7 @@ def test_appearance(browser: Chromium, tmp_path: Path) -> None:
         rgba = iio.imread(file)
         rgba[..., :3] //= 3
         iio.imwrite(file, rgba)
-    trainer = tiny_trainer("nerf-w", data, tmp_path / "run", max_num_iterations=200)
+    trainer = tiny_trainer("nerf-w", data, tmp_path / "run", appearance="vector", max_num_iterations=200)
     trainer.train()
     light = []
     with started(command("ns-viewer"), trainer.folder, "--websocket-port", 18907) as (_, address):

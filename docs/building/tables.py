@@ -7,6 +7,9 @@
   NAME. ROW is the first word in backticks of the line and COLUMN the heading of the column. With `best` behind
   a second colon the highest PSNR of a line is bold.
 - A table behind `<!-- measured: NAME -->` has the lines of that name in `measured.py`.
+- A figure of a sentence is before a comment on its line that names result and heading, as in `33.5 dB<!--
+  lego-nerfacto-300s: test PSNR -->`. Its number becomes the mean over the seeds, with as many digits behind the point.
+  Between two names, ` - ` is the difference, and ` / ` the ratio: `<!-- NAME - OTHER: test PSNR -->`.
 """
 
 from __future__ import annotations
@@ -22,14 +25,15 @@ from docs.building.measured import TABLES
 from nerfloom.benchmarks.results import read_rows
 
 DOCS = Path(__file__).parents[1]
-PAGES = (
-    "../README.md", "figures.md", "published.md", "guides/choosing.md", "benchmarks.md", "benchmarks-parts.md",
-    "stability.md",
-)  # fmt: skip
-"""The pages with such tables."""
+PAGES = ("../README.md", *sorted(page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")))
+"""The pages that may have such tables and figures."""
 COLUMNS = {column[0]: column for column in all_columns(("1", "1/2", "1/4", "1/8"), {})}
 MARK = re.compile(
     r"<!-- (results: (?P<name>[\w.-]+): (?P<shown>[^:]+?)(?P<best>: best)?|measured: (?P<table>[\w-]+)) -->"
+)
+FIGURE = re.compile(
+    r"(?P<number>-?\d[\d,]*(?:\.\d+)?)(?P<rest>[^\d<|\n]{0,12}"
+    r"<!-- (?P<one>[\w.-]+)(?: (?P<sign>[-/]) (?P<other>[\w.-]+))?: (?P<heading>[^:>\n]+) -->)"
 )
 Rows = Mapping[str, Any]
 """Results by name."""
@@ -42,14 +46,14 @@ def all_rows(folder: Path = DOCS / "results") -> dict[str, Any]:
 
 
 def filled(page: str, rows: Rows) -> str:
-    """Return a page with its tables filled in.
+    """Return a page with its tables and the figures of its sentences filled in.
 
     Args:
         page: the Markdown.
         rows: results by name.
 
     Raises:
-        KeyError: if a table names a result that is not there.
+        KeyError: if a table or a sentence names a result, a heading or a value that is not there.
     """
     lines: list[str] = []
     mark: re.Match[str] | None = None
@@ -70,7 +74,24 @@ def filled(page: str, rows: Rows) -> str:
         elif headings[-1] == "result" and (named := re.search(r"\| `([\w.-]+)` \|$", line)):
             line = _joined(_of_result(seeds(named[1], rows), headings, _cells(line)))
         lines.append(line)
-    return "\n".join(lines) + "\n"
+    return FIGURE.sub(lambda figure: _figure(figure, rows), "\n".join(lines) + "\n")
+
+
+def _figure(found: re.Match[str], rows: Rows) -> str:
+    """Return a figure of a sentence and its comment, with the value that the comment names."""
+    value, digits = _mean(found["one"], found["heading"], rows), len(found["number"].partition(".")[2])
+    if found["other"] is not None:
+        other = _mean(found["other"], found["heading"], rows)
+        value = value - other if found["sign"] == "-" else value / other
+    return f"{value:,.{digits}f}{found['rest']}"
+
+
+def _mean(name: str, heading: str, rows: Rows) -> float:
+    """Return the mean of a column over the seeds of a result."""
+    values = [value for value in map(COLUMNS[heading][1], seeds(name, rows)) if value is not None]
+    if not values:
+        raise KeyError(f"the result {name} has no {heading}")
+    return fmean(values)
 
 
 def _cells(line: str) -> list[str]:

@@ -78,6 +78,23 @@ def test_cells_are_filled_in_by_name(tables: ModuleType) -> None:
         tables.filled(page.replace("`b`", "`c`"), known)
 
 
+def test_figures_of_sentences_are_filled_in_by_name(tables: ModuleType) -> None:
+    known = {"a-x-5s": evaluation(31.04, steps=1200), "a-x-5s-seed43": evaluation(32.0, steps=1400)}
+    known |= {"b-x-5s": evaluation(30.0)}
+    page = """In 5 s 7.1 dB<!-- a-x-5s: test PSNR --> after 9<!-- a-x-5s: steps --> steps,
+-3.0 dB<!-- b-x-5s - a-x-5s: test PSNR --> and 2.00 times<!-- a-x-5s / b-x-5s: test PSNR -->, 0.25 s/image.
+"""
+    values = {"7.1 dB": "31.5 dB", " 9<": " 1,300<", "-3.0": "-1.5", "2.00": "1.05"}
+    true = page
+    for old, new in values.items():
+        true = true.replace(old, new)
+    assert tables.filled(page, known) == true
+    assert tables.filled(true, known) == true
+    for wrong in ("c-x-5s: test PSNR", "a-x-5s: test PSRN", "a-x-5s: floaters"):
+        with pytest.raises(KeyError):
+            tables.filled(f"7 dB<!-- {wrong} -->", known)
+
+
 def test_results_are_shown_or_rows_of_a_table(tables: ModuleType) -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md"))
     files = (ROOT / "configs" / "tables").glob("*.yml")

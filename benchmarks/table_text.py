@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from operator import sub, truediv
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -48,8 +49,17 @@ def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]
     def of_surface(figure: Callable[[dict[str, Any]], float | None]) -> Callable[[Result], float | None]:
         return lambda result: None if result.get("geometry") is None else figure(result["geometry"])
 
-    def memory(result: Result) -> float | None:
-        return None if (used := of_run("peak_memory_bytes")(result)) is None else used / 2**30
+    def of_bytes(name: str, unit: float) -> Callable[[Result], float | None]:
+        return lambda result: None if (size := of_run(name)(result)) is None else size / unit
+
+    def against(compare: Callable[[float, float], float], name: str) -> Callable[[Result], float | None]:
+        """Return a comparison of a result's value `name` with that of the run that it was made from."""
+
+        def compared(result: Result) -> float | None:
+            before = result.get("run", {}).get("after")
+            return None if before is None else compare(result["results"][name], before[name])
+
+        return compared
 
     return [
         ("test PSNR", lambda result: result["results"]["psnr"], "{:.2f} dB".format),
@@ -58,6 +68,8 @@ def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]
         (f"LPIPS ({NETWORK})", lambda result: result["results"].get("lpips"), "{:.3f}".format),
         *((f"size {size}", of_size(size), "{:.2f} dB".format) for size in sizes),
         *((heading, of_image(name), "{:.2f} dB".format) for heading, name in images.items()),
+        ("against its run", against(sub, "psnr"), "{:+.2f} dB".format),
+        ("normal MAE", lambda result: result["results"].get("normal_mae"), "{:.2f}°".format),
         ("floaters", lambda result: result["results"].get("floaters"), "{:.2f} %".format),
         ("Chamfer", of_surface(lambda found: found["chamfer_percent"]), "{:.3f} %".format),
         ("F-score", of_surface(lambda found: 100 * found["f_scores"][0]["f_score"]), "{:.1f} %".format),
@@ -66,8 +78,12 @@ def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]
         ("steps", of_run("steps"), "{:,.0f}".format),
         ("training rays/s", of_run("rays_per_second"), lambda rate: f"{float(f'{rate:.3g}'):,.0f}"),
         ("samples a ray", of_run("samples_per_ray"), "{:.1f}".format),
-        ("peak memory", memory, "{:.1f} GiB".format),
+        ("peak memory", of_bytes("peak_memory_bytes", 2**30), "{:.1f} GiB".format),
+        ("made in", of_run("wall_seconds"), "{:.0f} s".format),
+        ("file", of_bytes("bytes", 1e6), "{:.1f} MB".format),
         ("render", lambda result: 1 / result["results"]["fps"], "{:.2g} s/image".format),
+        ("images/s", lambda result: result["results"]["fps"], lambda rate: f"{float(f'{rate:.3g}'):g}"),
+        ("speed-up", against(truediv, "fps"), "{:.1f} x".format),
     ]
 
 

@@ -121,12 +121,7 @@ def measure(planned: PlannedRun, conditions: Conditions) -> Measured | None:
         p for p in points if p.get("full", True) and p["psnr"] is not None
     ]  # evaluations of other numbers of images are not comparable
     curve = tuple((float(p["seconds"]), float(p["psnr"])) for p in full)
-    profile, skips = (
-        read_json(planned.folder / "scene_profile.json") or {},
-        read_json(planned.folder / "skip_report.json") or [],
-    )
-    # As a user would train the same, without the comparison's folders.
-    flags = [*planned.contender.flags, *conditions.data_flags, "--machine.seed", str(planned.seed)]
+    skips = read_json(planned.folder / "skip_report.json") or []
     return Measured(
         label=planned.contender.label,
         method=planned.contender.method,
@@ -147,15 +142,21 @@ def measure(planned: PlannedRun, conditions: Conditions) -> Measured | None:
         skipped_steps=summary["skipped_steps"],
         curve=curve,
         seconds_to=whole_levels(curve),
-        decisions=tuple(f"{d['option']}: {d['choice']}, as {d['reason']}" for d in profile.get("decisions", [])),
+        decisions=decisions_of(planned.folder),
         skipped=tuple(f"{skip['skipped']:.1%} of {skip['name']}" for skip in skips),
         machine=summary["machine"],
-        command=shlex.join(["ns-train", planned.contender.method, *flags, *conditions.flags()]),
+        command=shlex.join(planned.user_command(conditions)),
         folder=str(planned.folder),
         lpips_note=evaluation["lpips"],
         masks_note=evaluation.get("masks"),
         geometry=evaluation.get("geometry"),
     )
+
+
+def decisions_of(folder: Path) -> tuple[str, ...]:
+    """Return the decisions of the scene's profile in the `folder` of a run; none if it has no profile."""
+    profile = read_json(folder / "scene_profile.json") or {}
+    return tuple(f"{d['option']}: {d['choice']}, as {d['reason']}" for d in profile.get("decisions", []))
 
 
 def read_json(path: Path) -> Any:

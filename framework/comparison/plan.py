@@ -179,9 +179,19 @@ class PlannedRun:
         return self.folder / "views"
 
     @property
+    def opened(self) -> Path:
+        """File that `ns-eval` opens after training."""
+        return self.folder / "config.yml"
+
+    @property
     def title(self) -> str:
         """Description of the run for messages."""
         return f"{self.contender.label}, seed {self.seed}"
+
+    def user_command(self, conditions: Conditions) -> list[str]:
+        """Return the command of a user who trains the same under `conditions`, without folders of the output."""
+        flags = [*self.contender.flags, *conditions.data_flags, "--machine.seed", str(self.seed)]
+        return ["ns-train", self.contender.method, *flags, *conditions.flags()]
 
     def train_command(self, conditions: Conditions) -> list[str]:
         """Return the command that trains under `conditions`."""
@@ -206,7 +216,7 @@ class PlannedRun:
 
     def eval_command(self, conditions: Conditions) -> list[str]:
         """Return the command that evaluates the trained model under `conditions`."""
-        command = python_command("nerfloom.cli.evaluate", "--load-config", self.folder / "config.yml")
+        command = python_command("nerfloom.cli.evaluate", "--load-config", self.opened)
         command += ["--output-path", str(self.evaluation), "--render-output-path", str(self.pictures)]
         command += ["--max-pictures", str(PICTURES), "--device-type", conditions.device_type]
         if conditions.max_eval_images is not None:

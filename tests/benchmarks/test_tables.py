@@ -5,32 +5,39 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
 import pytest
 
+from benchmarks import timed
 from benchmarks.__main__ import main
+from benchmarks.made import PROGRAMS
 from benchmarks.table_text import LOADING, estimate
 from benchmarks.tables import Row, read_table
 from nerfloom.base.errors import ConfigError
 from nerfloom.benchmarks.results import add_row
 from nerfloom.cli.train import run_of
 from nerfloom.comparison.plan import PlannedRun
+from nerfloom.jobs.job import Failure, Job
+from nerfloom.jobs.launcher import Ledger, nothing
 from nerfloom.jobs.processes import Processes
 from nerfloom.registry import registered
+from tests.cli.helpers import done_here
 from tests.comparison.runs import at_once, finish
 from tests.conftest import Refused
-from tests.site.commands import found
+from tests.site.commands import Checker, found
 
 TABLES = sorted((Path(__file__).parents[2] / "configs" / "tables").glob("*.yml"))
 FORMATS = {
-    "fern": "llff", "statue_of_liberty": "llff", "record3d_door": "record3d", "lego": "blender", "solids": "blender",
-    "bouncingballs": "dnerf", "standup": "dnerf",
+    "fern": "llff", "statue_of_liberty": "llff", "record3d_door": "record3d", "bouncingballs": "dnerf",
+    "standup": "dnerf", "fox": "nerfstudio", "snowmiku": "nerfstudio",
+    **dict.fromkeys(("lego", "lego800", "solids", "mirror", "metal", "varnish", "together"), "blender"),
 }  # fmt: skip
-"""Folders of the tables' data, and the formats that would be recognised; of any other, nerfstudio's."""
+"""Folders of the tables' data, and the formats that would be recognised."""
 ROWS = """
 images: {first: r_0.png}
 rows:
@@ -56,6 +63,22 @@ rows:
   - data: {ball: ball}
     methods: {ngp: instant-ngp}
     seconds: [10]
+"""
+
+MADE = """
+rows:
+  - data: {ball: ball}
+    methods: {ngp: instant-ngp}
+    seconds: [10]
+    seeds: 2
+  - data: {ball: ball}
+    methods: {octree: ns-bake RUN --max-megabytes 5, pupil: kilo-nerf --teacher RUN}
+    seconds: [20]
+    seeds: 2
+    after: ngp-10s
+  - data: {street: --street 2}
+    methods: {blocks: ns-blocks --max-cameras 9}
+    seconds: [5]
 """
 
 
@@ -124,6 +147,18 @@ def test_a_row_for_each_data_set_method_budget_and_seed(tmp_path: Path) -> None:
             "rows: [{data: {a: b}, methods: {c: kplanes}, seconds: [1], geometry: {referenc_mesh: a.ply}}]",
             "geometry: unknown key 'referenc_mesh'. Did you mean 'reference_mesh'",
         ),
+        ("rows: [{data: {a: b}, methods: {c: ns-bake RUN}, seconds: [1]}]", "'after' belong together"),
+        ("rows: [{data: {a: b}, methods: {c: kplanes}, seconds: [1], after: d-1s}]", "'after' belong together"),
+        (
+            "rows: [{data: {a: b}, methods: {c: ns-bake RUN}, seconds: [1], after: d-1s}]",
+            "no row above is 'd-1s' of a with seed 42",
+        ),
+        ("rows: [{data: {a: ''}, methods: {c: ns-blocks}, seconds: [1], seeds: 2}]", "ns-blocks has no seed"),
+        (
+            "rows: [{data: {a: b --x 1}, methods: {c: kplanes}, seconds: [1]}, "
+            "{data: {a: b --x 1}, methods: {d: ns-bake RUN}, seconds: [1], after: c-1s}]",
+            "needs the name of the data format before '--x 1'",
+        ),
     ],
 )
 def test_what_is_no_table(text: str, reason: str, tmp_path: Path) -> None:
@@ -151,10 +186,12 @@ def test_every_row_of_our_tables_is_understood(path: Path, which: str, monkeypat
     """By the commands that are run, which are parsed as they will be; the data need not be there."""
 
     def here(data: Path | None, named: str | None = None) -> tuple[Path | None, str]:
-        return (data, named or FORMATS[data.name]) if data and data.name in FORMATS else found(data, named)
+        return (data, named or FORMATS[data.name]) if data else found(data, named)
 
     monkeypatch.setattr("nerfloom.training.data_folder.find_data", here)
-    rows = read_table(path, Path("data"), Path("runs")).rows
+    rows = [
+        row for row in read_table(path, Path("data"), Path("runs")).rows if row.planned.contender.method not in PROGRAMS
+    ]
     understood = list({row.planned.contender.label: row for row in rows}.values())
     for row in understood if which == "all" else some_of(understood):
         words = row.planned.train_command(row.conditions)
@@ -163,6 +200,27 @@ def test_every_row_of_our_tables_is_understood(path: Path, which: str, monkeypat
         assert run.config.max_seconds == row.seconds
         assert run.config.machine.seed == row.planned.seed
     assert rows
+
+
+def test_what_other_commands_make_in_our_tables_is_understood(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    checker, checked = Checker(monkeypatch, tmp_path), set[str]()
+    for path in TABLES:
+        for row in read_table(path, tmp_path, tmp_path / "runs").rows:
+            if (program := PROGRAMS.get(row.planned.contender.method)) is not None:
+                words = row.planned.train_command(row.conditions)
+                checker.check([row.planned.contender.method, *words[words.index(program.module) + 1 :]])
+                words = row.planned.eval_command(row.conditions)
+                checker.check(["ns-eval", *words[words.index("nerfloom.cli.evaluate") + 1 :]])
+                checked.add(row.planned.contender.method)
+    assert checked == set(PROGRAMS)
+
+
+def test_rows_of_one_name_are_one_run() -> None:
+    """A sentence and a cell name a row without its table, and the run of a row is shared by all tables."""
+    labels: dict[str, str] = {}
+    for path in TABLES:
+        for row in read_table(path, Path("data"), Path("runs")).rows:
+            assert labels.setdefault(row.name, row.planned.contender.label) == row.planned.contender.label, row.name
 
 
 def rows_of(folder: Path) -> dict[str, Any]:
@@ -232,7 +290,7 @@ def test_means_and_spreads_over_seeds(
     head, _, *lines = capsys.readouterr().out.splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in (head, *lines)]
     titles = ["run", "test PSNR", "SSIM", "size 1", "size 1/2", "first", "steps"]
-    assert cells[0] == [*titles, "training rays/s", "peak memory", "render", "result"]
+    assert cells[0] == [*titles, "training rays/s", "peak memory", "render", "images/s", "result"]
     assert [row[0] for row in cells[1:]] == [
         f"ball, {method}, {seconds} s" for seconds in (10, 45) for method in ("ngp", "planes")
     ]
@@ -241,8 +299,8 @@ def test_means_and_spreads_over_seeds(
     spread = f"{stdev(psnrs):.2f} dB"
     assert cells[3][1] == f"{fmean(psnrs):.2f} ± {spread}"
     assert cells[3][2:6] == ["0.900", "29.00 ± 0.00 dB", "30.00 ± 0.00 dB", f"{fmean(psnrs) - 1:.2f} ± {spread}"]
-    assert cells[3][6:] == ["1,000", "22,000", "1.0 GiB", "0.25 s/image", "`ball-ngp-45s`"]
-    assert cells[2][1:] == [""] * 10
+    assert cells[3][6:] == ["1,000", "22,000", "1.0 GiB", "0.25 s/image", "4", "`ball-ngp-45s`"]
+    assert cells[2][1:] == [""] * 11
 
 
 def test_surfaces_are_judged_by_the_reference_of_their_block(tmp_path: Path) -> None:
@@ -380,3 +438,149 @@ def test_a_table_that_is_stopped_goes_on(tmp_path: Path) -> None:
     assert all(image["psnr"] > 10 for image in content["per_image"])
     shown = subprocess.run([*words, *folders, "--show", "markdown"], check=True, capture_output=True, text=True).stdout
     assert f"| tiny, ngp, 8 s | {content['results']['psnr']:.2f} dB | " in shown
+
+
+def test_a_row_after_a_run_is_made_from_it(tmp_path: Path) -> None:
+    rows = {row.name: row for row in read_table(write(tmp_path, MADE), tmp_path / "data", tmp_path / "runs", 0.1).rows}
+    octree, pupil, run = rows["ball-octree-2s-seed43"], rows["ball-pupil-2s-seed43"], rows["ball-ngp-1s-seed43"]
+    words = octree.planned.train_command(octree.conditions)
+    made = words[words.index("nerfloom.cli.bake") + 1 :]
+    assert made[:5] == [str(run.planned.folder), "--max-megabytes", "5", "--fine-tune-seconds", "2.0"]
+    assert made[-2:] == ["--output-path", str(octree.planned.opened)]
+    words = octree.planned.eval_command(octree.conditions)
+    assert words[words.index("--load-config") + 1] == str(octree.planned.opened)
+    assert words[-2:] == ["--data", str(tmp_path / "data" / "ball")]
+    words = pupil.planned.train_command(pupil.conditions)
+    assert words[words.index("--teacher") + 1] == str(run.planned.folder)
+    blocks = rows["street-blocks-0.5s"]
+    assert blocks.planned.user_command(blocks.conditions) == [
+        "ns-blocks", "--max-cameras", "9", "--max-seconds", "0.5", "--data-flags=--street 2"
+    ]  # fmt: skip
+    assert "--data" not in blocks.planned.eval_command(blocks.conditions)
+
+
+def jobs_here(outcome: Callable[[Job], str | None]) -> Callable[..., dict[Job, Failure]]:
+    """A launcher's `run` with an outcome for each job: why it failed, or None."""
+
+    def run(_: object, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
+        ledger = Ledger(jobs, on_finished)
+        for job in ledger.unfinished():
+            ledger.ended(job, outcome(job))
+        return ledger.failures
+
+    return run
+
+
+def test_rows_after_a_run_wait_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = {row.name: row for row in read_table(write(tmp_path, MADE), tmp_path / "data", tmp_path / "runs").rows}
+    ran: list[str] = []
+    broken = {"ball-ngp-10s-seed43"}
+
+    def outcome(job: Job) -> str | None:
+        ran.append(job.title)
+        if job.title in broken:
+            return "it has crashed"
+        octree = {"wall_seconds": 47.2, "bytes": 25_460_000} if "octree" in job.title else {}
+        finish(known[job.title].planned, 30.0 - len(job.title) / 10, **octree)
+        return None
+
+    monkeypatch.setattr(Processes, "run", jobs_here(outcome))
+    bench(monkeypatch, tmp_path, "--only", "octree-20s$")
+    assert ran == ["ball-ngp-10s", "ball-octree-20s"]
+    with pytest.raises(SystemExit):
+        bench(monkeypatch, tmp_path, "--only", "ball")
+    assert "3 rows failed, first ball-ngp-10s-seed43: it has crashed" in capsys.readouterr().err
+    assert ran[2:] == ["ball-ngp-10s-seed43", "ball-pupil-20s"]
+    broken.clear()
+    bench(monkeypatch, tmp_path)
+    assert ran[4:] == ["ball-ngp-10s-seed43", "street-blocks-5s", "ball-octree-20s-seed43", "ball-pupil-20s-seed43"]
+    rows = rows_of(tmp_path / "results")
+    assert str(tmp_path) not in json.dumps(rows)
+    assert rows["ball-octree-20s"]["run"]["command"] == "ns-bake RUN --max-megabytes 5 --fine-tune-seconds 20.0"
+    assert "--teacher RUN " in rows["ball-pupil-20s"]["run"]["command"]
+    assert rows["ball-octree-20s"]["run"]["after"] == {"row": "ball-ngp-10s", "psnr": 30.0 - 12 / 10, "fps": 4.0}
+    capsys.readouterr()
+    bench(monkeypatch, tmp_path, "--show", "markdown", "--only", "octree")
+    head, _, line = capsys.readouterr().out.splitlines()
+    shown = dict(zip(*([cell.strip() for cell in each.strip("|").split("|")] for each in (head, line)), strict=True))
+    assert shown["against its run"] == "-0.30 ± 0.00 dB"
+    assert (shown["made in"], shown["file"], shown["images/s"], shown["speed-up"]) == ("47 s", "25.5 MB", "4", "1.0 x")
+
+
+SMALL = "--num-levels 4 --max-resolution 64 --log2-table-size 12 --grid-resolution 16 --num-steps 64"
+NGP = f"instant-ngp {SMALL} --samples-per-batch 4096"
+PUPIL = "--network-resolution 2 --grid-resolution 16 --num-steps 64 --samples-per-batch 1024 --distill-steps 3"
+
+
+def by_their_commands(job: Job) -> str | None:
+    """Run the commands of a job in this process, which saves the seconds that new ones take to begin."""
+    for step in job.steps:
+        words = list(step.command)
+        if "-m" in words:
+            name, *arguments = words[words.index("-m") + 1 :]
+            done = done_here(import_module(name).main, [name, *arguments])
+        else:
+            arguments = words[words.index(str(Path(timed.__file__).resolve())) + 1 :]
+            done = done_here(lambda given=arguments: timed.main(*given), words)
+        if done.returncode:
+            return done.stderr
+    return None
+
+
+@pytest.mark.medium
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules")  # timed.py runs a module that is imported here
+def test_an_octree_and_a_pupil_of_a_run(shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Processes, "run", jobs_here(by_their_commands))
+    write(
+        tmp_path,
+        f"""
+rows:
+  - data: {{ball: ball}}
+    methods: {{ngp: {NGP} --max-num-iterations 60}}
+    seconds: [600]
+  - data: {{ball: ball}}
+    methods: {{octree: ns-bake RUN --resolution 16}}
+    seconds: [0.1]
+    after: ngp-600s
+  - data: {{ball: ball}}
+    methods: {{pupil: kilo-nerf --teacher RUN --max-num-iterations 3 {PUPIL}}}
+    seconds: [600]
+    after: ngp-600s
+""",
+    )
+    bench(monkeypatch, tmp_path, "--data-root", shared_tiny.parent, "--only", "octree|pupil")
+    rows = rows_of(tmp_path / "results")
+    assert set(rows) == {"ball-ngp-600s", "ball-octree-0.1s", "ball-pupil-600s"}
+    run, octree = rows["ball-ngp-600s"], rows["ball-octree-0.1s"]
+    assert octree["method_name"] == "octree"
+    assert octree["run"]["after"]["psnr"] == run["results"]["psnr"]
+    assert len(octree["per_image"]) == len(run["per_image"]) == 3
+    assert octree["run"]["wall_seconds"] > 0
+    assert 500 < octree["run"]["bytes"] < 1e6
+    assert rows["ball-pupil-600s"]["run"]["steps"] == 3
+    for row in rows.values():
+        assert row["results"]["psnr"] > 5
+        assert row["run"]["machine"] == run["run"]["machine"]
+
+
+@pytest.mark.slow  # two blocks, their visibility and their colours
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules")
+def test_a_street_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Processes, "run", jobs_here(by_their_commands))
+    write(
+        tmp_path,
+        f"""
+rows:
+  - data: {{street: --street 2 --size 24 --num-train 18}}
+    methods:
+      blocks: ns-blocks --method "{NGP} --max-num-iterations 12" --max-cameras 12 --min-cameras 3 --overlap 0.2
+    seconds: [600]
+""",
+    )
+    bench(monkeypatch, tmp_path)
+    (row,) = rows_of(tmp_path / "results").values()
+    assert row["run"]["command"].endswith("--max-seconds 600.0 '--data-flags=--street 2 --size 24 --num-train 18'")
+    assert row["results"]["psnr"] > 5
+    assert "bytes" not in row["run"]

@@ -30,7 +30,7 @@ def run(name: str, *arguments: object, folder: Path | None = None) -> subprocess
 
 def called(name: str, *arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run a short command within this process, which saves the second that a new process takes to begin."""
-    return _called(_entry(name).load(), [name, *map(str, arguments)], folder)
+    return done_here(_entry(name).load(), [name, *map(str, arguments)], folder)
 
 
 @functools.cache  # to look through all installed packages takes longer than many a command
@@ -43,10 +43,13 @@ def benchmarked(*arguments: object) -> subprocess.CompletedProcess[str]:
     """The same of `python -m benchmarks`."""
     from benchmarks.__main__ import main
 
-    return _called(main, ["benchmarks", *map(str, arguments)], None)
+    return done_here(main, ["benchmarks", *map(str, arguments)])
 
 
-def _called(main: Callable[[], None], words: list[str], folder: Path | None) -> subprocess.CompletedProcess[str]:
+def done_here(
+    main: Callable[[], None], words: list[str], folder: Path | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Call `main` within this process, with `words` as the command line, in `folder` or the working folder."""
     here = Path.cwd()
     code, out, err = 0, io.StringIO(), io.StringIO()
     os.chdir(folder or here)

@@ -15,7 +15,7 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.framing import framed
 from nerfloom.data.dataset import Dataset
 from nerfloom.evaluation.images import to_uint8
-from nerfloom.evaluation.paths import around
+from nerfloom.evaluation.paths import outlooks
 from nerfloom.evaluation.videos import write_images
 from nerfloom.export.bake import Baking, bake
 from nerfloom.export.levels_page import levels_page, remove_other_chunks
@@ -144,9 +144,9 @@ def _check(settings: WebSettings, kind: str, model: Renderable, regions: Sequenc
 
 
 def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[str]]:
-    """Return the cameras of a page and their names: of the photographs, or some around a scene without."""
+    """Return the cameras of a page and their names: of the photographs, or of a scene without."""
     if dataset is None:
-        cameras = around(model.scene)
+        cameras = outlooks(model.scene)
         return cameras, [f"view {number + 1}" for number in range(len(cameras))]
     return pinhole(dataset.cameras), list(dataset.names)
 

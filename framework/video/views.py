@@ -170,7 +170,7 @@ def _circle(settings: OrbitSettings, loaded: Loaded) -> Views:
     if is_capture and not settings.full_circle:
         say(about_arc(arc))
     elif scene.unbounded and not is_capture:
-        say("without photographs, the path goes all around, also where nothing was photographed")
+        say("without photographs, the path goes all around (with --data DIR: where they were taken)")
     along, radius = fractions(settings.count, ease=settings.ease), in_scene(settings.radius, loaded)
     return path_views(settings, loaded, orbit(cameras, middle, along, arc, radius, is_capture), settings.time)
 

@@ -187,9 +187,9 @@ def test_the_origin_is_under_what_the_cameras_look_at(
     )
     model = DrawnGaussians(edited.gaussians, edited.look, scene)
     loaded = Loaded(model, placement, "gaussian-splatting", Path("a.ply"), Path("a.ply"))
-    up = tuple(turn.apply([0.0, 0, 1]).tolist())
+    x, y, z = turn.apply([0.0, 0, 1]).tolist()
     known = dataclasses.replace(edited, loaded=loaded, placement=placement)
-    placed = edit.align_floor(known, up=up).gaussians.means
+    placed = edit.align_floor(known, up=(x, y, z)).gaussians.means
     assert ("under the point" in capsys.readouterr().err) == is_seen
     factor, rotation, shift = align(edited.gaussians.means[::50], placed[::50])  # what has been done to all of it
     assert factor == pytest.approx(1)

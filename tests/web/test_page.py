@@ -243,7 +243,7 @@ def test_a_page_turns_by_itself_where_photographs_were_taken() -> None:
     assert turning_arc(cameras, [0.0] * 3, torch.eye(3).double()) == pytest.approx([0.45, 0.9], abs=1e-5)
     turned = turning_arc(cameras, [0.0] * 3, about_z(1.0)[:, :3].double())
     assert turned == pytest.approx([1.45, 0.9], abs=1e-5)
-    ring = torch.stack([about_z(a) for a in torch.arange(7) * (2 * math.pi / 7)])
+    ring = torch.stack([about_z(k * 2 * math.pi / 7) for k in range(7)])
     assert turning_arc(replace(some_cameras(7), camera_to_worlds=ring), [0.0] * 3, torch.eye(3).double()) is None
 
 

@@ -50,7 +50,7 @@ class EditFlags(RegionFlags, OpenFlags):
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Direction that becomes +z, as in --up=-y."""
     floor: bool = False
-    """Find the floor, and make it the plane z = 0."""
+    """Find the floor, and make it the plane z = 0, with the origin under what the cameras look at."""
     scale: float | None = None
     """New lengths per old length, about the origin."""
     max_megabytes: float | None = None

@@ -45,7 +45,7 @@ class RunFlags(OpenFlags):
     """The trained run, the file of Gaussians, or the octree, and how it is shown."""
 
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Up axis of a file of Gaussians without data, as in --up=-y. Default: z."""
+    """Up axis of a file of Gaussians without data, as in --up=-y. Default: as its run had it, or else z."""
     level_error: float | None = None
     """For a .levels file: largest standard deviation of a merged Gaussian, pixels; 0: merge none. Default: 1."""
     memory_limit: float | None = None

@@ -15,7 +15,7 @@ from nerfloom.edit.similarity import Similarity
 from nerfloom.export.run_gaussians import finite, moment_of
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
 from nerfloom.splats.look import OURS, Look
-from nerfloom.splats.placed_files import in_input, write_placed
+from nerfloom.splats.placed_files import capture_cameras, in_input, write_placed
 from nerfloom.splats.spz_container import SpzVersion
 from nerfloom.splats.transform import transformed, transformed_in_float64
 from nerfloom.training.loaded import Loaded
@@ -120,7 +120,10 @@ class Edited:
         turned = torch.eye(4, dtype=torch.float64)[:3]
         turned[:, :3] = rotation_between(self.upwards, UP)
         placement = Placement(turned, 1.0)
-        return write_placed(Path(file), self.gaussians, self.look, self.scale, placement, max_megabytes, spz_version)
+        cameras = None if self.loaded is None else capture_cameras(self.loaded.model, self.placement)
+        kept = None if cameras is None else cameras.placed(placement)
+        path = Path(file)
+        return write_placed(path, self.gaussians, self.look, self.scale, placement, max_megabytes, spz_version, kept)
 
     def photographed(self, step: str) -> Loaded:
         """Return the run or file with photographs of the Gaussians, which the step named `step` needs.

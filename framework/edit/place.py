@@ -6,16 +6,18 @@ import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
-from nerfloom.cameras.poses import rotation_between
+from nerfloom.cameras.poses import looked_at, rotation_between
 from nerfloom.cameras.scale import checked
 from nerfloom.edit.edited import UP, Edited
 from nerfloom.edit.similarity import Similarity, about, axis_rotation, direction, vector
 from nerfloom.geometry.alignment import align
-from nerfloom.geometry.floor import find_floor
+from nerfloom.geometry.floor import Plane, find_floor
 from nerfloom.geometry.regions import Vector
+from nerfloom.renderable import training_poses
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 """The origin."""
@@ -101,9 +103,11 @@ def align_floor(
     min_opacity: float = 0.5,
     seed: int = 0,
 ) -> Edited:
-    """Find the floor, and turn Gaussians about its middle so that it becomes the plane z = 0.
+    """Find the floor, and move Gaussians so that it becomes the plane z = 0, with the origin under the subject.
 
-    The floor is a plane: most opaque Gaussians have their centres on it, and few have them below.
+    The floor is a plane: most opaque Gaussians have their centres on it, and few have them below. The subject is the
+    point that the cameras look at. If they are not known, or it is outside of the opaque Gaussians or below the floor,
+    the origin is the floor's middle.
 
     Args:
         up: the direction that is about upwards, of any length but 0; None for the up direction of the last `set_up` or
@@ -128,6 +132,21 @@ def align_floor(
     rotation = rotation_between(floor.normal, UP)
     tilt = math.degrees(2 * math.asin(min(float((floor.normal - UP).norm()) / 2, 1.0)))
     say(f"align_floor: {floor.share:.0%} of the opaque Gaussians are on the floor, which was tilted by {tilt:.2f}°")
-    place = floor.center * vector((1.0, 1.0, 0.0))
-    moved = edited.moved(Similarity(rotation, 1.0, place - rotation @ floor.center))
-    return replace(moved, up=UP)
+    subject = _subject(edited, opaque, floor)
+    if subject is None:
+        foot, where = floor.center, "in its middle"
+    else:
+        foot = subject - floor.normal * ((subject - floor.center) @ floor.normal)
+        where = "under the point that the cameras look at"
+    say(f"align_floor: the origin is on the floor, {where}")
+    return replace(edited.moved(Similarity(rotation, 1.0, -(rotation @ foot))), up=UP)
+
+
+def _subject(edited: Edited, opaque: Tensor, floor: Plane) -> Tensor | None:
+    """Return the point (3,) that cameras look at, if it is among centres `opaque` (N, 3) and above the floor."""
+    poses = None if edited.loaded is None else training_poses(edited.loaded.model)
+    point = None if poses is None or not len(poses) else looked_at(edited.placement.original_poses(poses.cpu()))
+    if point is None or float((point - floor.center) @ floor.normal) < 0:
+        return None
+    inside = (point >= opaque.amin(0)) & (point <= opaque.amax(0))
+    return point if bool(inside.all()) else None

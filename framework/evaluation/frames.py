@@ -13,6 +13,7 @@ import shutil
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,11 @@ TIMED = 2
 """The frame that tells how long the others take. The first also prepares the data that all of them use."""
 PIECE = 2**24
 """Number of bytes of a file hashed at a time."""
+MAX_PLAIN = 2**31
+"""Maximum number of bytes of all frames together for them to be kept as they are. Compressing a frame takes longer than
+drawing a simple one."""
+LEVEL = 1
+"""Level of the compression of larger renders: the fastest."""
 
 
 @dataclass(frozen=True)
@@ -72,25 +78,42 @@ class Frames:
             ConfigError: if a frame cannot be written.
         """
         missing = [index for index in range(self.count) if self.read(index) is None]
-        done = self.count - len(missing)
-        if done:
+        if done := self.count - len(missing):
             say(f"{done} of {self.count} frames already exist in {self.folder}; rendering the others")
         try:
-            for number, index in enumerate(track(missing, "Rendering", total=len(missing)), 1):
-                start = time.monotonic()
-                content = io.BytesIO()
-                arrays: dict[str, Any] = dict(render(index))
-                np.savez_compressed(content, **arrays)
-                write_file(self.path(index), content.getvalue())
-                done += 1
-                if number == TIMED and (left := len(missing) - number):
-                    say(f"the other {left:,} frames take about {time_text((time.monotonic() - start) * left)}")
+            with ThreadPoolExecutor(1) as writer:  # a frame is written while the next one is rendered
+                self._render(missing, render, writer)
         except BaseException as error:
+            done = sum(self.path(index).exists() for index in range(self.count))
             if not done:  # nothing to continue
                 self.remove()
             elif isinstance(error, KeyboardInterrupt):
                 say(f"{done} of {self.count} frames are in {self.folder}; repeat the command to continue")
             raise
+
+    def _render(self, missing: list[int], render: Callable[[int], Arrays], writer: ThreadPoolExecutor) -> None:
+        """Render the `missing` frames, and let `writer` write them, at most one late."""
+        last: Future[None] | None = None
+        for number, index in enumerate(track(missing, "Rendering", total=len(missing)), 1):
+            start = time.monotonic()
+            arrays = render(index)
+            if last is not None:
+                last.result()
+            last = writer.submit(self._keep, index, arrays)
+            if number == TIMED and (left := len(missing) - number):
+                say(f"the other {left:,} frames take about {time_text((time.monotonic() - start) * left)}")
+        if last is not None:
+            last.result()
+
+    def _keep(self, index: int, arrays: Arrays) -> None:
+        """Write frame `index`, compressed if all frames together would be large."""
+        plain = self.count * sum(values.nbytes for values in arrays.values()) <= MAX_PLAIN
+        content, method = io.BytesIO(), zipfile.ZIP_STORED if plain else zipfile.ZIP_DEFLATED
+        with zipfile.ZipFile(content, "w", method, compresslevel=LEVEL) as file:  # as numpy's savez, which has no level
+            for name, values in arrays.items():
+                with file.open(f"{name}.npy", "w") as part:
+                    np.lib.format.write_array(part, values, allow_pickle=False)
+        write_file(self.path(index), content.getvalue())
 
     def remove(self) -> None:
         """Remove the frames, and the folder beside the file unless it has frames of another render."""

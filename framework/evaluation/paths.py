@@ -31,6 +31,8 @@ MAX_GAP = 60.0
 """Cameras stand all around a centre if no gap between them exceeds this angle, degrees."""
 MIN_HORIZONTAL = 0.2
 """Cameras closer to the vertical axis than this, relative to the mean horizontal distance, count as above or below."""
+NEARBY = math.radians(20)
+"""Standard deviation, radians, of the weights of the cameras in a direction of an orbit."""
 SMOOTHING = 24
 """Number of cameras divided by the standard deviation, in cameras, of the weights of an interpolated path."""
 MIN_WIDTH = 0.5
@@ -88,9 +90,7 @@ def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
         cameras: M cameras.
         center: (3,) centre, scene units.
     """
-    offsets = (cameras.camera_to_worlds[:, :2, 3] - center[:2]).double().cpu()
-    away = offsets.norm(dim=-1)
-    offsets = offsets[away > MIN_HORIZONTAL * away.mean()]
+    offsets = _beside(cameras, center)
     if len(offsets) < MIN_CAMERAS:
         return None
     angles = torch.atan2(offsets[:, 1], offsets[:, 0]).sort().values
@@ -100,6 +100,13 @@ def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
         return None
     width = 2 * math.pi - float(gaps[largest])
     return Arc(float(angles[(largest + 1) % len(angles)]) + width / 2, width)
+
+
+def _beside(cameras: Cameras, center: Tensor) -> Tensor:
+    """Return the offsets (K, 3) float64 from a centre (3,) of cameras that are not almost above or below it."""
+    offsets = (cameras.camera_to_worlds[:, :, 3] - center).double().cpu()
+    away = offsets[:, :2].norm(dim=-1)
+    return offsets[away > MIN_HORIZONTAL * away.mean()]
 
 
 def fractions(count: int, closed: bool = True, ease: bool = False) -> Tensor:
@@ -117,30 +124,51 @@ def fractions(count: int, closed: bool = True, ease: bool = False) -> Tensor:
 
 
 def orbit(
-    cameras: Cameras, center: Tensor, along: Tensor, arc: Arc | None = None, radius: float | None = None
+    cameras: Cameras,
+    center: Tensor,
+    along: Tensor,
+    arc: Arc | None = None,
+    radius: float | None = None,
+    follow: bool = False,
 ) -> Cameras:
-    """Return cameras on a horizontal circle, looking at its centre; the path is closed.
+    """Return cameras that go around a centre and look at it; the path is closed.
 
-    Height and radius are the means over the given cameras, and intrinsics come from the first camera.
+    Intrinsics come from the first camera. The path is a horizontal circle, with the mean height and distance of the
+    given cameras; or it follows them, and so stays where they have looked from: in each direction, elevation and
+    distance are the means over the cameras, weighted by a von Mises distribution of the angle between (`NEARBY`).
 
     Args:
         cameras: M cameras.
         center: (3,) centre, scene units.
         along: (F,) fraction of the path at each frame, from `fractions`.
-        arc: part of the circle; the cameras swing on it once back and forth, slowly at its ends; None for the whole
-            circle.
-        radius: another radius of the circle, scene units. The height changes alike, so that the elevation stays.
+        arc: directions of the path; it swings over them once back and forth, slowly at its ends; None for all around.
+        radius: another mean horizontal distance of the cameras, scene units. The height changes alike, so that the
+            elevation stays.
+        follow: whether the path follows the cameras.
     """
-    offsets = cameras.camera_to_worlds[:, :, 3] - center
-    height, distance = offsets[:, 2].mean(), offsets[:, :2].norm(dim=-1).mean()
-    if radius is not None:
-        height, distance = height * (radius / distance.clamp(min=1e-6)), torch.tensor(radius)
-    angles = (2 * torch.pi * along).float()
+    offsets = (cameras.camera_to_worlds[:, :, 3] - center).double().cpu()
+    height, mean = offsets[:, 2].mean(), offsets[:, :2].norm(dim=-1).mean()
+    angles = 2 * torch.pi * along.double().cpu()
     if arc is not None:
         angles = arc.middle + arc.width / 2 * angles.sin()
-    circle = torch.stack([distance * angles.cos(), distance * angles.sin(), height.expand(len(angles))], dim=-1)
-    poses = torch.stack([look_at(center + offset, center) for offset in circle])
+    heights, away = height.expand(len(angles)), mean.expand(len(angles))
+    if follow and len(beside := _beside(cameras, center)):
+        elevations, distances = _followed(beside, angles)
+        heights, away = distances * elevations.sin(), distances * elevations.cos()
+    path = torch.stack([away * angles.cos(), away * angles.sin(), heights], dim=-1)
+    if radius is not None:
+        path = path * (radius / mean.clamp(min=1e-6))
+    poses = torch.stack([look_at(center + offset, center) for offset in path.to(center)])
     return replace_poses(cameras, poses)
+
+
+def _followed(offsets: Tensor, angles: Tensor) -> tuple[Tensor, Tensor]:
+    """Return elevations, radians, and distances (F,) of cameras at `offsets` (K, 3) in directions `angles` (F,)."""
+    distances = offsets.norm(dim=-1)
+    elevations = torch.asin((offsets[:, 2] / distances.clamp(min=1e-12)).clamp(-1, 1))
+    apart = angles[:, None] - torch.atan2(offsets[:, 1], offsets[:, 0])
+    weights = torch.softmax(apart.cos() / NEARBY**2, dim=-1)  # of K cameras, for each direction
+    return weights @ elevations, weights @ distances
 
 
 def around(scene: Scene, count: int = 8) -> Cameras:
@@ -151,6 +179,14 @@ def around(scene: Scene, count: int = 8) -> Cameras:
     places = torch.stack([math.cos(ABOVE) * angles.cos(), math.cos(ABOVE) * angles.sin(), height], dim=-1)
     poses = torch.stack([look_at(middle + reach * place, middle) for place in places])
     return perspective(poses, scene.image_size, scene.image_size, OPENING)
+
+
+def outlooks(scene: Scene) -> Cameras:
+    """Return pinhole cameras for a `scene` without photographs: where its cameras stood, or else around its box."""
+    poses = scene.camera_to_worlds
+    if poses is None:
+        return around(scene)
+    return perspective(poses.cpu(), scene.image_size, scene.image_size, OPENING)
 
 
 # -- a walk past cameras ------------------------------------------------------------------------------------------

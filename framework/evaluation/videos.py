@@ -15,8 +15,9 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.evaluation.frames import write_file
 from nerfloom.evaluation.video_suffixes import VIDEO
 
-QUALITY = 18
-"""Constant rate factor of H.264; 18 is considered visually lossless."""
+PRESET, QUALITY = "veryfast", 17
+"""Preset and constant rate factor of H.264. For 20 frames of a cup, error and size are those of the default preset with
+18, which is considered visually lossless, within 0.1 dB and 5 %; encoding takes about half of the time."""
 JPEG_QUALITY = 95
 """Quality of JPEG images, 1 to 95."""
 GIF_UNIT = 10
@@ -74,7 +75,7 @@ def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
         macro_block_size=1,
         pixelformat="yuv420p",
         ffmpeg_log_level="error",
-        output_params=["-crf", str(QUALITY), "-movflags", "+faststart"],
+        output_params=["-crf", str(QUALITY), "-preset", PRESET, "-movflags", "+faststart"],
     )
     with writer:
         for picture in pictures:

@@ -10,7 +10,7 @@ from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.export.settings import SplatSettings
 from nerfloom.geometry.regions import Region, inside_all
 from nerfloom.splats.gaussians import Gaussians, HasGaussians
-from nerfloom.splats.placed_files import in_input, write_placed
+from nerfloom.splats.placed_files import capture_cameras, in_input, write_placed
 from nerfloom.training.loaded import Loaded
 
 
@@ -98,6 +98,7 @@ def _write(
         say(f"{int(inside.sum()):,} of {len(placed):,} Gaussians are in the region that is kept")
         placed = placed[inside]
     limit, version = settings.max_megabytes, settings.spz_version
-    for sentence in write_placed(path, placed, look, loaded.scale, placement, limit, version):
+    cameras = capture_cameras(loaded.model, placement)
+    for sentence in write_placed(path, placed, look, loaded.scale, placement, limit, version, cameras):
         say(sentence)
     say(f"{path.stat().st_size / 1e6:.2f} MB, {look.words()}: {path}")

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
+from nerfloom.cameras.camera_path import CameraPath
+from nerfloom.cameras.kept_cameras import read_cameras, write_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, read_scale, write_scale
 from nerfloom.data.offsets import read_offset
@@ -21,7 +23,7 @@ from nerfloom.levels.building import build_levels
 from nerfloom.levels.files import read_levels
 from nerfloom.splats.files import stream_gaussians
 from nerfloom.splats.gaussians import Gaussians, HasGaussianParts, HasGaussians
-from nerfloom.splats.placed_files import in_input
+from nerfloom.splats.placed_files import capture_cameras, in_input
 from nerfloom.splats.stream import GaussianStream
 from nerfloom.training.loaded import Loaded
 
@@ -45,7 +47,8 @@ def export_levels(loaded: Loaded, path: Path, settings: LevelsSettings, regions:
         raise ConfigError(f"ns-export levels: {loaded.method} has no Gaussians; ns-train gaussian-splatting makes them")
     moment, origin = moment_of(model.scene.moving, settings.time), torch.zeros(3, dtype=torch.float64)
     stream = GaussianStream(partial(_parts, model, moment, loaded.placement), model.look())
-    _write(path, stream, origin, settings, regions, loaded.scale)
+    cameras = capture_cameras(loaded.model, loaded.placement)
+    _write(path, stream, origin, settings, regions, loaded.scale, cameras)
 
 
 def _parts(model: HasGaussians, moment: float | None, placement: Placement, most: int) -> Iterator[Gaussians]:
@@ -77,7 +80,7 @@ def export_file_levels(file: Path, path: Path, settings: LevelsSettings, regions
     scale = read_scale(file)
     if scale.is_known:
         say(scale.words())
-    _write(path, stream_gaussians(file), read_offset(file), settings, regions, scale)
+    _write(path, stream_gaussians(file), read_offset(file), settings, regions, scale, read_cameras(file))
 
 
 def _write(
@@ -87,12 +90,14 @@ def _write(
     settings: LevelsSettings,
     regions: Sequence[Region],
     scale: Scale,
+    cameras: CameraPath | None,
 ) -> None:
     kept = GaussianStream(_within(stream.parts, origin, regions), stream.look)
     left_out = build_levels(path, kept, origin, settings.chunk_size, settings.bits, settings.build_memory)
     if left_out:
         say(f"{left_out:,} Gaussians cannot be drawn and are left out")
     write_scale(path, scale)
+    write_cameras(path, cameras)
     found = read_levels(path)
     size = path.stat().st_size / 1e6
     say(

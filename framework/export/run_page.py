@@ -15,7 +15,7 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.framing import framed
 from nerfloom.data.dataset import Dataset
 from nerfloom.evaluation.images import to_uint8
-from nerfloom.evaluation.paths import around
+from nerfloom.evaluation.paths import outlooks
 from nerfloom.evaluation.videos import write_images
 from nerfloom.export.bake import Baking, bake
 from nerfloom.export.levels_page import levels_page, remove_other_chunks
@@ -33,6 +33,7 @@ from nerfloom.export.web import (
     pinhole,
     room,
     shown_cameras,
+    turning_arc,
     upright,
     with_still,
 )
@@ -80,17 +81,20 @@ def export_page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequ
     chosen = torch.tensor([order[rank] for rank in ranks])
     turn = upright(cameras, dataset is not None and dataset.z_is_up)
     red, green, blue = model.background.tolist()
+    focus = focus_of(cameras, turn)
+    is_capture = model.scene.unbounded and (dataset is not None or model.scene.camera_to_worlds is not None)
     facts = PageFacts(
         title=_title(loaded) if settings.title is None else printable(settings.title),
         about=_about(loaded, kind, moment),
         background=(red, green, blue),
         near=smallest_depth(model.scene),
         look=None,
-        focus=focus_of(cameras, turn),
+        focus=focus,
         cameras=camera_rows(cameras[chosen], [printable(names[i]) for i in chosen.tolist()], turn),
         unit_length=loaded.unit,
         unit=loaded.scale.unit,
         relative_error=loaded.scale.relative_error,
+        arc=turning_arc(cameras, focus, turn) if is_capture else None,
         photographed=dataset is not None,
         start=ranks.index(start),
         url=settings.url or "",
@@ -144,9 +148,9 @@ def _check(settings: WebSettings, kind: str, model: Renderable, regions: Sequenc
 
 
 def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[str]]:
-    """Return the cameras of a page and their names: of the photographs, or some around a scene without."""
+    """Return the cameras of a page and their names: of the photographs, or of a scene without."""
     if dataset is None:
-        cameras = around(model.scene)
+        cameras = outlooks(model.scene)
         return cameras, [f"view {number + 1}" for number in range(len(cameras))]
     return pinhole(dataset.cameras), list(dataset.names)
 

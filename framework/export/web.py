@@ -32,6 +32,7 @@ from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.base.evenly_spaced import strided
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import looked_at, rotation_between
+from nerfloom.evaluation.paths import arc_of
 from nerfloom.splats.gaussian_limit import fitted_spz
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import Look
@@ -89,6 +90,9 @@ class PageFacts:
     """Name of the unit of lengths; empty for the input's unit."""
     relative_error: float | None = 0.0
     """Standard deviation of `unit_length`, as a fraction of it; None if it is not known."""
+    arc: list[float] | None = None
+    """Middle and width, radians from x towards y around `focus`, of the directions of a capture's photographs, if they
+    do not go all around: where the page turns by itself. None for all around."""
     photographed: bool = True
     """Whether `cameras` belong to photographs, which determine how precise a length is."""
     start: int = 0
@@ -187,6 +191,19 @@ def focus_of(cameras: Cameras, turn: Tensor) -> list[float]:
         size = float((centers - centers.mean(0)).norm(dim=-1).max()) or 1.0
         point = centers.mean(0) + size * forward.mean(0)
     return [round(value, 6) for value in (turn @ point).tolist()]
+
+
+def turning_arc(cameras: Cameras, focus: Sequence[float], turn: Tensor) -> list[float] | None:
+    """Return the value of `PageFacts.arc` for the cameras of a capture.
+
+    Args:
+        cameras: M cameras.
+        focus: position x, y, z that they look at, in the turned frame.
+        turn: (3, 3) rotation of the scene.
+    """
+    poses = (turn @ cameras.camera_to_worlds.double().cpu()).float()
+    arc = arc_of(replace(cameras, camera_to_worlds=poses), torch.tensor(focus))
+    return None if arc is None else [round(arc.middle, 6), round(arc.width, 6)]
 
 
 def make_page(gaussians: Gaussians, facts: PageFacts, max_megabytes: float) -> tuple[str, list[str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import torch
+from torch import Tensor
 
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.poses import NEAR, Placement, rotation_between
@@ -23,7 +24,18 @@ IMAGE_SIZE = 800
 """Longer side of rendered pictures, pixels."""
 
 
-def placed_gaussians(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, Scene]:
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+"""The up direction of scenes."""
+
+
+def direction_of(axis: Axis) -> Tensor:
+    """Return the unit vector (3,) float64 of an `axis`."""
+    direction = torch.zeros(3, dtype=torch.float64)
+    direction[get_args(Axis).index(axis) % 3] = -1.0 if axis.startswith("-") else 1.0
+    return direction
+
+
+def placed_gaussians(gaussians: Gaussians, up: Tensor = UP) -> tuple[Placement, Scene]:
     """Return the placement of Gaussians without images, and their scene.
 
     The median of the centres becomes the origin, and half of the Gaussians are then within `HALF_WITHIN` of it. Medians
@@ -31,7 +43,7 @@ def placed_gaussians(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, S
 
     Args:
         gaussians: N Gaussians in the frame of their file.
-        up: the direction in that frame that becomes +z.
+        up: (3,) float64 direction in that frame that becomes +z.
 
     Returns:
         The placement of the file's frame in the scene's, and a scene without cameras and with a box from -1 to 1. It is
@@ -49,9 +61,7 @@ def placed_gaussians(gaussians: Gaussians, up: Axis = "z") -> tuple[Placement, S
     distances = (means - middle).norm(dim=-1)
     half = float(distances.median()) or finite.typical_size or 1.0
     scale = HALF_WITHIN / half
-    direction = torch.zeros(3, dtype=torch.float64)
-    direction[get_args(Axis).index(up) % 3] = -1.0 if up.startswith("-") else 1.0
-    rotation = rotation_between(direction, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    rotation = rotation_between(up, UP)
     placement = Placement(torch.cat([rotation, -(rotation @ middle)[:, None]], dim=-1), scale)
     bounded = float((scale * distances > 1).double().mean()) <= OUTSIDE
     scene = Scene(

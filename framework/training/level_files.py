@@ -33,7 +33,7 @@ def load_levels(
         data: folder of the photographs; None without.
         data_format: format of the data, with its flags; None to detect it.
         device_type: auto, cpu, cuda or mps.
-        up: up axis in the frame of the file, for a file without data; None for z.
+        up: up axis in the frame of the file, for a file without data; None for that of the cameras beside it, or z.
         settings: the detail of pictures, and the memory for it.
 
     Raises:

@@ -41,7 +41,7 @@ def load(
         device_type: auto, cpu, cuda or mps.
         data: folder of the data, if a run's has moved; optional data for a file.
         data_format: data format for a file, with its flags; None to detect it.
-        up: up axis of a file of Gaussians without data; None for z.
+        up: up axis of a file of Gaussians without data; None for that of the cameras kept beside it, or else z.
         settings: changed settings by name, of a run (as in `rays_per_pixel=4`) or of a file of levels
             (`DetailSettings`); None for its own value.
 

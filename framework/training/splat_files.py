@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,8 @@ from nerfloom.base.console import say
 from nerfloom.base.device import choose_device
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.machine_config import MachineConfig
+from nerfloom.cameras.camera_path import CameraPath
+from nerfloom.cameras.kept_cameras import read_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale, read_scale
 from nerfloom.data.offsets import offset_file, read_offset
@@ -21,7 +24,7 @@ from nerfloom.geometry.local_origin import local_origin, rounding
 from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.files import read_gaussians
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.placement import Axis, placed_gaussians
+from nerfloom.splats.placement import UP, Axis, direction_of, placed_gaussians
 from nerfloom.splats.transform import transformed
 from nerfloom.training.file_data import DataFormat, scene_of, source_of
 from nerfloom.training.loaded import Loaded
@@ -42,7 +45,7 @@ def load_splats(
         data: folder of the photographs; None without.
         data_format: format of the data, with its flags; None to detect it.
         device_type: auto, cpu, cuda or mps.
-        up: up axis in the frame of the file, for a file without data; None for z.
+        up: up axis in the frame of the file, for a file without data; None for that of the cameras beside it, or z.
 
     Raises:
         ConfigError: if the data do not fit.
@@ -91,17 +94,14 @@ def place(
         data: folder of the photographs; None without.
         data_format: format of the data, with its flags; None to detect it.
         machine: device of the model.
-        up: up axis in the frame of the file, for a file without data; None for z.
+        up: up axis in the frame of the file, for a file without data; None for that of the cameras beside it, or z.
 
     Raises:
         ConfigError: if the data do not fit.
         DataError: if the data cannot be read, or are elsewhere.
     """
     if data is None and data_format is None:
-        frame, scene = placed_gaussians(gaussians, up or "z")
-        if up is None:
-            say("without photographs, z is assumed to point up (else: --up=-y, as in many captures, or --data DIR)")
-        return Place(frame, frame.about(-offset), scene, None)
+        return _place_alone(gaussians, offset, read_cameras(file), up)
     if up is not None:
         raise ConfigError("--up has no effect with --data, which determines the up direction; leave it out")
     source = source_of(METHOD, file, data, data_format, machine)
@@ -110,6 +110,21 @@ def place(
     frame = placement.about(offset)
     _check_place(file, gaussians, frame, parsed)
     return Place(frame, placement, scene, source)
+
+
+def _place_alone(gaussians: Gaussians, offset: Tensor, cameras: CameraPath | None, up: Axis | None) -> Place:
+    """Return the place of a file's Gaussians without data, where `cameras` that are kept beside it are known or not."""
+    upwards = UP if up is None else direction_of(up)
+    if up is None and cameras is not None and cameras.placement is not None:
+        upwards = cameras.placement.original_directions(UP[None])[0]
+    elif up is None:
+        say("without photographs, z is assumed to point up (else: --up=-y, as in many captures, or --data DIR)")
+    frame, scene = placed_gaussians(gaussians, upwards)
+    placement = frame.about(-offset)
+    if cameras is not None:
+        poses = cameras.placed(placement).poses.float()
+        scene = replace(scene, num_cameras=len(poses), camera_to_worlds=poses, unbounded=True)
+    return Place(frame, placement, scene, None)
 
 
 def _check_place(file: Path, given: Gaussians, frame: Placement, parsed: ParsedScene) -> None:

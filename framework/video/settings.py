@@ -218,13 +218,14 @@ class SpiralSettings(FlightSettings):
 
 @dataclass(frozen=True)
 class OrbitSettings(FlightSettings):
-    """A horizontal circle around the scene, with the mean height and distance of the training cameras.
+    """A horizontal circle around an object, or a loop around what a capture looks at, where its photographs were taken.
 
-    If the photographs of a capture leave out a sixth of the circle or more, the path swings over their part and back.
+    In each direction the loop is as high and as far as the photographs there. If they leave out a sixth of the circle
+    or more, the path swings over their part and back.
     """
 
     radius: float | None = None
-    """Radius of the circle, units of exports; its height changes alike. Default: the cameras' mean distance."""
+    """Mean radius of the path, units of exports; its height changes alike. Default: the cameras' mean distance."""
     full_circle: bool = False
     """Go around the full circle even where photographs of a capture are missing, instead of a swing and back."""
     time: float | None = None

@@ -24,14 +24,15 @@ from nerfloom.data.image_files import reduce_image
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.paths import (
+    Arc,
     Walk,
     arc_of,
-    around,
     focus_distance,
     fractions,
     interpolate,
     middle_pose,
     orbit,
+    outlooks,
     replace_poses,
     shortest_order,
     spiral,
@@ -159,19 +160,27 @@ def _circle(settings: OrbitSettings, loaded: Loaded) -> Views:
         raise ConfigError(f"--time {settings.time:g}: the photographs of this run have no times")
     if settings.time is not None and not 0 <= settings.time <= 1:
         raise FlagError(f"--time is {settings.time:g}; it must be from 0 to 1")
-    has_photographs = loaded.source is not None
-    cameras = learnt_cameras(loaded.parsed("train")) if has_photographs else around(scene)
+    cameras = outlooks(scene) if loaded.source is None else learnt_cameras(loaded.parsed("train"))
+    # Around an object all directions are rendered; a capture is known only where its photographs were taken.
+    is_capture = scene.unbounded and (loaded.source is not None or scene.camera_to_worlds is not None)
     # An object's centre is the box's; a capture's is the point that its cameras look at.
-    target = looked_at(cameras.camera_to_worlds) if scene.unbounded and has_photographs else None
+    target = looked_at(cameras.camera_to_worlds) if is_capture else None
     middle = scene.box.mean(0).cpu() if target is None else target.float()
-    # Around an object all directions are rendered; a capture is known only in the directions of its photographs.
-    is_partial = scene.unbounded and has_photographs and not settings.full_circle
-    arc = arc_of(cameras, middle) if is_partial else None
-    if arc is not None:
-        swept = f"the photographs go around {math.degrees(arc.width):.0f} of 360 degrees"
-        say(f"{swept}: the path swings there and back (--full-circle True goes all around)")
+    arc = arc_of(cameras, middle) if is_capture and not settings.full_circle else None
+    if is_capture and not settings.full_circle:
+        say(about_arc(arc))
+    elif scene.unbounded and not is_capture:
+        say("without photographs, the path goes all around (with --data DIR: where they were taken)")
     along, radius = fractions(settings.count, ease=settings.ease), in_scene(settings.radius, loaded)
-    return path_views(settings, loaded, orbit(cameras, middle, along, arc, radius), settings.time)
+    return path_views(settings, loaded, orbit(cameras, middle, along, arc, radius, is_capture), settings.time)
+
+
+def about_arc(arc: Arc | None) -> str:
+    """Return a sentence about the directions of an orbit: an `arc`, or None for all around."""
+    if arc is None:
+        return "the path goes all around, in each direction as high and as far as the photographs there"
+    swept = f"the photographs cover {math.degrees(arc.width):.0f} of 360 degrees"
+    return f"{swept}: the path swings to and fro over them (--full-circle True goes all around)"
 
 
 def _spiral(settings: SpiralSettings, loaded: Loaded) -> Views:

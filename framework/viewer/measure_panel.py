@@ -106,7 +106,8 @@ class MeasurePanel:
         for number, (point, size) in enumerate(self._points):
             scene.add_icosphere(f"{ROOM}/{number}", radius=size, color=COLOR, position=tuple(point.tolist()))
         if len(self._points) < 2:
-            self._tell("Click the second point.")
+            place = self._queue.loaded.placement.original_points(self._points[0][0][None])[0]
+            self._tell(f"{','.join(f'{value:.6g}' for value in place.tolist())}  \nClick the second point.")
             return
         ends = torch.stack([point for point, _ in self._points])
         loaded = self._queue.loaded

@@ -149,12 +149,12 @@ def test_an_orbit_goes_where_a_capture_was_taken_from(
     words = ("--num-frames", 4, "--output-path", tmp_path / "frames")
     done = called("ns-render", "orbit", capture_run, *words)
     assert done.returncode == 0, done.stderr
-    (around,) = (int(line.split()[4]) for line in done.stderr.splitlines() if "the path swings there and back" in line)
+    (around,) = (int(line.split()[3]) for line in done.stderr.splitlines() if "the path swings to and fro" in line)
     assert around == pytest.approx(math.degrees(3.8) * 6 / 8, abs=2)  # the first and the last of nine are held out
     frames = [iio.imread(tmp_path / "frames" / f"{index:05d}.png") for index in range(4)]
     assert np.array_equal(frames[0], frames[2])  # the middle, both ways
     for run, flags in ((capture_run, ("--full-circle", "True")), (ball_run, ())):
-        assert "go around" not in called("ns-render", "orbit", run, *words, *flags).stderr
+        assert "swings" not in called("ns-render", "orbit", run, *words, *flags).stderr
 
 
 def test_outputs_apart_and_in_folders(capture_run: Path, shows_a_ball: float, tmp_path: Path) -> None:
@@ -406,9 +406,12 @@ def test_the_radius_of_an_orbit_is_in_the_unit_of_exports(
         return Picture(torch.zeros(view.height, view.width, 3), *[torch.ones(view.height, view.width)] * 3)
 
     monkeypatch.setattr(RayModel, "render_view", render_view)
-    words = ("--num-frames", 4, "--full-circle", "True", "--radius", 2.5)
-    done = called("ns-render", "orbit", capture_run, *words, "--output-path", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    found = load_trained(capture_run).placement.original_points(torch.stack(places))
-    away = (found - found.mean(0)).norm(dim=-1)  # the middle of the circle is the mean of its quarters
-    torch.testing.assert_close(away, torch.full((4,), 2.5, dtype=torch.float64), atol=1e-4, rtol=0)
+    for name, radius in (("as they are", ()), ("near", ("--radius", 1.5))):
+        done = called("ns-render", "orbit", capture_run, "--num-frames", 4, *radius, "--output-path", tmp_path / name)
+        assert done.returncode == 0, done.stderr
+    placement = load_trained(capture_run).placement
+    offsets = placement.original_points(torch.stack(places)) - torch.from_numpy(CENTER)  # which the cameras look at
+    cameras = torch.from_numpy(poses()[1:8, :3, 3] - CENTER)  # the first and the last are held out
+    up = placement.original_directions(torch.tensor([[0.0, 0, 1]]))[0]
+    horizontal = (cameras - (cameras @ up)[:, None] * up).norm(dim=-1).mean()
+    torch.testing.assert_close(offsets[4:], offsets[:4] * (1.5 / horizontal), atol=1e-4, rtol=0)

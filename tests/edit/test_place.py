@@ -15,8 +15,13 @@ from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.scale import Scale
 from nerfloom.edit.edited import Edited
+from nerfloom.evaluation.paths import look_at
+from nerfloom.geometry.alignment import align
+from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.files import read_gaussians
 from nerfloom.splats.gaussians import Gaussians
+from nerfloom.splats.placement import placed_gaussians
+from nerfloom.training.loaded import Loaded
 from tests.edit.clouds import at, scattered
 from tests.splats.test_files import covariances, directions, published, seen
 from tests.splats.test_gltf import light_from, read
@@ -156,15 +161,41 @@ def room(tilt: float) -> tuple[Edited, Tensor]:
 
 @pytest.mark.parametrize("tilt", [0.0, 12.0, -30.0])
 def test_a_tilted_floor_becomes_the_plane_z_is_0(tilt: float) -> None:
-    """The error is below a millionth; all heights are above it, and its middle stays where it was from above."""
+    """The error is below a millionth; all heights are above it, and its middle is the origin."""
     edited, heights = room(tilt)
     placed = edit.align_floor(edited)
     found = placed.gaussians.means
     assert float((found[:, 2] - heights).abs().max()) < 1e-6
     again = edit.align_floor(edited)
     assert torch.equal(again.gaussians.means, found)
-    before, after = edited.gaussians.means[:1500].mean(0), found[:1500].mean(0)
-    torch.testing.assert_close(after[:2], before[:2], atol=1e-6, rtol=0)
+    torch.testing.assert_close(found[:1500].mean(0), torch.zeros(3).double(), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 12.0])
+@pytest.mark.parametrize(("subject", "is_seen"), [((1.0, -0.5, 0.8), True), ((1.0, -0.5, -0.3), False)])
+def test_the_origin_is_under_what_the_cameras_look_at(
+    tilt: float, subject: tuple[float, float, float], is_seen: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A point of the room, with cameras around it in a scene of another place and scale; or one below the floor."""
+    edited, _ = room(tilt)
+    placement = Placement(COLMAP, 0.25)
+    turn = Rotation.from_euler("xyz", [tilt, 0.4 * tilt, 50.0], degrees=True)
+    point = torch.from_numpy(turn.apply(subject)) + torch.tensor([4.0, -7.0, 2.5])
+    poses = torch.stack([look_at(point + 3 * away, point) for away in directions(12)])
+    scene = dataclasses.replace(
+        placed_gaussians(edited.gaussians)[1], camera_to_worlds=placement.poses(poses).float(), num_cameras=12
+    )
+    model = DrawnGaussians(edited.gaussians, edited.look, scene)
+    loaded = Loaded(model, placement, "gaussian-splatting", Path("a.ply"), Path("a.ply"))
+    x, y, z = turn.apply([0.0, 0, 1]).tolist()
+    known = dataclasses.replace(edited, loaded=loaded, placement=placement)
+    placed = edit.align_floor(known, up=(x, y, z)).gaussians.means
+    assert ("under the point" in capsys.readouterr().err) == is_seen
+    factor, rotation, shift = align(edited.gaussians.means[::50], placed[::50])  # what has been done to all of it
+    assert factor == pytest.approx(1)
+    foot = rotation @ point + shift if is_seen else placed[:1500].mean(0)
+    torch.testing.assert_close(foot[:2], torch.zeros(2).double(), atol=1e-4, rtol=0)
+    assert float(foot[2]) == pytest.approx(subject[2] if is_seen else 0, abs=1e-4)
 
 
 def test_a_floor_of_another_up_direction() -> None:

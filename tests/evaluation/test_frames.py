@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from nerfloom.base.errors import ConfigError
+from nerfloom.evaluation import frames as kept_frames
 from nerfloom.evaluation.frames import Frames, hash_of_file, hash_of_tensors, key_of, open_frames
 from nerfloom.evaluation.outputs import Arrays
 
@@ -25,7 +26,12 @@ class Renderer:
         return {"rgb": np.full((2, 2, 3), index, np.uint8), "depth": np.full((2, 2), index / 3, np.float32)}
 
 
-def test_a_stopped_render_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("limit", [kept_frames.MAX_PLAIN, 0])
+def test_a_stopped_render_goes_on(
+    limit: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames as they are, and compressed ones."""
+    monkeypatch.setattr(kept_frames, "MAX_PLAIN", limit)
     facts = {"run": "a", "num_frames": 5}
     first, second = Renderer(stop=3), Renderer()
     with pytest.raises(KeyboardInterrupt):

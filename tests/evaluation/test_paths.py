@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from scipy.special import ive
 from torch import Tensor
 
 from nerfloom import Picture, View
@@ -66,6 +67,45 @@ def test_orbit_keeps_height_and_distance_and_looks_at_the_centre() -> None:
     near = orbit(cameras, torch.zeros(3), fractions(8), radius=2.0).camera_to_worlds
     torch.testing.assert_close(near[:, :, 3], centers / 2)
     torch.testing.assert_close(near[:, :, :3], path.camera_to_worlds[:, :, :3])
+
+
+def test_an_orbit_that_follows_is_as_high_and_as_far_as_the_cameras_there() -> None:
+    """The mean of a cosine under a von Mises distribution is the cosine times I1(k) / I0(k), here with k = 1 / s^2."""
+    azimuths = torch.arange(360, dtype=torch.float64).deg2rad()
+    elevations, distances = 0.7 + 0.4 * azimuths.cos(), 3 - azimuths.sin()
+    away, heights = distances * elevations.cos(), distances * elevations.sin()
+    poses = torch.eye(4)[:3].repeat(360, 1, 1)
+    poses[:, :, 3] = torch.stack([away * azimuths.cos(), away * azimuths.sin(), heights], -1).float() + CENTER
+    ones = torch.ones(360)
+    cameras = Cameras(poses, ones, ones, ones, ones, ones.long(), ones.long())
+    path = orbit(cameras, CENTER, fractions(36), follow=True).camera_to_worlds
+    offsets = (path[:, :, 3] - CENTER).double()
+    at, sharpness = torch.atan2(offsets[:, 1], offsets[:, 0]), 1 / math.radians(20) ** 2
+    flatter = float(ive(1, sharpness) / ive(0, sharpness))
+    assert flatter > 0.9
+    found = offsets.norm(dim=-1)
+    torch.testing.assert_close(found, 3 - flatter * at.sin(), atol=1e-5, rtol=0)
+    torch.testing.assert_close((offsets[:, 2] / found).asin(), 0.7 + 0.4 * flatter * at.cos(), atol=1e-5, rtol=0)
+    for pose in path:
+        check_pose(pose, "orbit")
+    half = orbit(cameras, CENTER, fractions(36), radius=float(away.mean()) / 2, follow=True).camera_to_worlds
+    torch.testing.assert_close((half[:, :, 3] - CENTER).double(), offsets / 2, atol=1e-5, rtol=0)
+
+
+def test_an_orbit_above_a_gap_is_as_high_as_the_cameras_behind_it() -> None:
+    """Low cameras in front and high ones behind, at the same place each: the path does not sink behind."""
+    low, high = standing(torch.arange(-100, 101, 5)), standing(torch.arange(110, 251, 20), radius=1.0)
+    high.camera_to_worlds[:, 2, 3] = 3.0
+    cameras = replace_poses(low, torch.cat([low.camera_to_worlds, high.camera_to_worlds]))
+    assert arc_of(cameras, CENTER) is None
+    offsets = orbit(cameras, CENTER, fractions(8), follow=True).camera_to_worlds[:, :, 3] - CENTER
+    torch.testing.assert_close(offsets[0], torch.tensor([2.0, 0, 1]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(offsets[4], torch.tensor([-1.0, 0, 3]), atol=0.05, rtol=0)
+
+
+def test_an_orbit_that_follows_cameras_above_is_a_circle() -> None:
+    cameras = standing(torch.tensor([10]), radius=0.0)
+    assert float(orbit(cameras, CENTER, fractions(4), follow=True).camera_to_worlds[:, 2, 3].min()) == 1
 
 
 def test_frames_are_even_or_ease_in_and_out() -> None:

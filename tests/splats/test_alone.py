@@ -19,7 +19,7 @@ from nerfloom.export.web import gaussians_of
 from nerfloom.kernels.splats.project import DC
 from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.placement import HALF_WITHIN, placed_gaussians
+from nerfloom.splats.placement import HALF_WITHIN, direction_of, placed_gaussians
 from nerfloom.splats.transform import transformed
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.render_queue import RenderQueue
@@ -78,7 +78,7 @@ def test_half_of_them_are_near_the_middle_and_the_rest_does_not_count() -> None:
 
 @pytest.mark.parametrize(("up", "axis"), [("z", (0, 0, 1)), ("-y", (0, -1, 0)), ("x", (1, 0, 0)), ("-z", (0, 0, -1))])
 def test_up_is_up(up: str, axis: tuple[float, float, float]) -> None:
-    placement, _ = placed_gaussians(ball(), up)  # type: ignore[arg-type]
+    placement, _ = placed_gaussians(ball(), direction_of(up))  # type: ignore[arg-type]
     turned = placement.transform[:, :3] @ torch.tensor(axis, dtype=torch.float64)
     torch.testing.assert_close(turned, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     assert float(torch.linalg.det(placement.transform[:, :3])) == pytest.approx(1)

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,13 +38,14 @@ def four_cameras() -> Cameras:
     return Cameras(poses, 200 * one, 200 * one, 100 * one, 75 * one, (200 * one).long(), (150 * one).long())
 
 
-def two_balls() -> str:
+def two_balls(arc: list[float] | None = None) -> str:
     """The page of a red Gaussian in the origin, which the cameras look at, and a blue one beside it."""
     colors = torch.tensor([RED, BLUE]) / 255 * 3.54 - 1.77
     means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.4, 0.15]])
     turns = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2)
     balls = Gaussians(means, torch.full((2, 3), 0.06).log(), turns, torch.full((2,), 8.0), colors, torch.zeros(2, 3, 0))
-    return make_page(balls, replace(some_facts("Two balls"), cameras=rows(), focus=[0.0] * 3, unit="m"), 30)[0]
+    facts = replace(some_facts("Two balls"), cameras=rows(), focus=[0.0] * 3, arc=arc, unit="m")
+    return make_page(balls, facts, 30)[0]
 
 
 def rows() -> list[list[object]]:
@@ -110,6 +112,24 @@ def blob(tab: Tab, color: Sequence[int]) -> tuple[np.ndarray, float]:
     lines, columns = inside.nonzero()
     assert len(lines) > 20, "it is not on the page"
     return np.array([columns.mean() + 0.5, lines.mean() + 0.5]), math.sqrt(len(lines) / math.pi)
+
+
+def test_it_turns_to_and_fro_where_photographs_were_taken(live: Chromium, tmp_path: Path) -> None:
+    """Over an arc of 0.5 radians around the direction of the first camera, past neither end."""
+    (tmp_path / "a.html").write_text(two_balls([0.0, 0.5]), encoding="utf-8")
+    tab = opened(live, (tmp_path / "a.html").as_uri())
+    seen: list[float] = []
+
+    def passed(angle: float) -> bool:
+        x, y, _ = numbers(tab, "eye")
+        seen.append(math.atan2(y, x))
+        return (seen[-1] > angle) if angle > 0 else (seen[-1] < angle)
+
+    press(tab, "spin")
+    for angle in (-0.2, 0.2, -0.2):
+        until(lambda angle=angle: passed(angle))
+    assert max(map(abs, seen)) < 0.26
+    tab.close()
 
 
 MIDDLE: Place = (DESK[0] / 2, DESK[1] / 2)

@@ -30,6 +30,7 @@ from nerfloom.export.web import (
     payload_of,
     pinhole,
     shown_cameras,
+    turning_arc,
     upright,
     with_still,
 )
@@ -234,6 +235,16 @@ def test_lenses_become_pinholes() -> None:
     assert pinhole(replace(cameras, model="equirectangular")).fx.tolist() == [75.0] * 4
     with pytest.raises(ConfigError, match="orthographic"):
         pinhole(replace(cameras, model="orthographic"))
+
+
+def test_a_page_turns_by_itself_where_photographs_were_taken() -> None:
+    """Cameras at 0, 0.5 and 0.9 radians, and turned by 1 with the scene; none if they are all around."""
+    cameras = replace(some_cameras(3), camera_to_worlds=torch.stack([about_z(a) for a in (0.0, 0.9, 0.5)]))
+    assert turning_arc(cameras, [0.0] * 3, torch.eye(3).double()) == pytest.approx([0.45, 0.9], abs=1e-5)
+    turned = turning_arc(cameras, [0.0] * 3, about_z(1.0)[:, :3].double())
+    assert turned == pytest.approx([1.45, 0.9], abs=1e-5)
+    ring = torch.stack([about_z(k * 2 * math.pi / 7) for k in range(7)])
+    assert turning_arc(replace(some_cameras(7), camera_to_worlds=ring), [0.0] * 3, torch.eye(3).double()) is None
 
 
 def about_z(angle: float) -> torch.Tensor:

@@ -15,6 +15,7 @@ const BACKGROUNDS = [[0, 0, 0], [0.5, 0.5, 0.5], [1, 1, 1]];
 const QUALITIES = ["automatic", "full", "fast"]; // automatic: coarser while it moves on a slow device
 const STEEPEST = 1.55; // radians
 const SLOW = 50, QUICK = 22; // milliseconds a frame
+const SPEED = 0.4; // of turning by itself, radians a second
 
 /** Show why there is no picture. */
 function refuse(error) {
@@ -67,6 +68,21 @@ function orbited(view, dx, dy) {
   return { ...next, eye: add(pivot, axesOf(next).forward, -view.distance) };
 }
 
+/** Return the angle from the end of an arc of directions around `focus` to a view's eye: positive outside, in radians. */
+function beyond({ eye }, [middle, width], focus) {
+  const angle = Math.atan2(eye[1] - focus[1], eye[0] - focus[0]) - middle;
+  return Math.abs(Math.atan2(Math.sin(angle), Math.cos(angle))) - width / 2;
+}
+
+/** Turn a view by itself for some seconds, in the direction `way` of 1 or -1: around, or to and fro over the arc of the
+ * photographs, slowly at its ends. Return the view and the direction. */
+function spun(view, way, seconds, { arc, focus }) {
+  if (!arc) return [orbited(view, SPEED * seconds, 0), way];
+  const inside = -beyond(view, arc, focus), share = inside < 0 ? 1 : Math.min(Math.max(inside / 0.4, 0.15), 1);
+  const angle = SPEED * share * seconds, next = orbited(view, way * angle, 0), out = beyond(next, arc, focus);
+  return out > 0 && out > -inside ? [orbited(view, -way * angle, 0), -way] : [next, way];
+}
+
 function zoomed(view, factor) {
   const distance = Math.max(view.distance * factor, 1e-6);
   return { ...view, distance, eye: add(view.eye, axesOf(view).forward, view.distance - distance) };
@@ -109,7 +125,7 @@ function show(gl, scene, facts) {
   const measure = ruler(facts);
   const cameras = facts.cameras, asked = chosen(options.get("camera")), start = asked >= 0 ? asked : facts.start;
   let camera = start, view = viewOf(cameras[start], facts.focus), background = facts.background;
-  let spinning = options.get("spin") === "1" && !plain, dirty = true;
+  let spinning = options.get("spin") === "1" && !plain, way = 1, dirty = true;
   let quality = Math.max(QUALITIES.indexOf(options.get("quality")), 0);
   const keys = new Set();
 
@@ -207,7 +223,11 @@ function show(gl, scene, facts) {
       const sum = ways.reduce((a, b) => add(a, b), [0, 0, 0]);
       look({ ...moved(view, step * sum[0], step * sum[1], step * sum[2]) });
     }
-    if (spinning) look(orbited(view, 0.4 * seconds, 0));
+    if (spinning) {
+      const [next, onwards] = spun(view, way, seconds, facts);
+      way = onwards;
+      look(next);
+    }
     return ways.length > 0;
   }
 

@@ -22,9 +22,11 @@ from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.surfaces.opacity import surface_opacity
 from nerfloom.losses.surfaces import (
+    ANYWHERE,
     EVERY,
     Curvature,
     DistanceBounds,
+    Eikonal,
     Silhouette,
     SurfacePoints,
     beyond_bounds,
@@ -512,6 +514,27 @@ def test_the_curvature_term_is_that_of_level_sets() -> None:
     assert nearest < 0.02
     found.backward()
     assert float(field.distance.second.grad.abs().max()) > 0  # type: ignore[union-attr]
+
+
+def test_the_eikonal_term_counts_samples_and_the_whole_box(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gradients of length 2 at samples and of length 1 elsewhere: the mean is the share of the samples."""
+    torch.manual_seed(0)
+    trainer, field = exact_ball()
+    shown = shown_by(trainer, draw_batch(trainer.train_set, 64, "white"))
+    samples = shown.rendered.samples
+    assert samples is not None
+    assert samples.features is not None
+    unit = torch.nn.functional.normalize(samples.features[:, :3], dim=-1)
+    longer = dataclasses.replace(samples, features=torch.cat([2 * unit, samples.features[:, 3:]], dim=-1))
+    asked, shape = [], field.shape
+    monkeypatch.setattr(field, "shape", lambda where: asked.append(where) or shape(where))
+    found = Eikonal()(dataclasses.replace(shown, rendered=dataclasses.replace(shown.rendered, samples=longer)))
+    at_samples, elsewhere = len(samples) / EVERY, len(samples) // ANYWHERE
+    assert elsewhere > 100
+    assert [len(where) for where in asked] == [elsewhere]
+    assert float(found) == pytest.approx(at_samples / (at_samples + elsewhere), rel=0.01)  # type: ignore[arg-type]
+    low, high = asked[0].amin(0), asked[0].amax(0)
+    torch.testing.assert_close(torch.stack([low, high]), field.box, atol=0.1, rtol=0)
 
 
 def test_a_single_sample_has_a_curvature() -> None:

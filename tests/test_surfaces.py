@@ -16,7 +16,7 @@ from nerfloom.data.pixels.batch import PixelBatch, draw_batch
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.export.lattice import lattice_of
 from nerfloom.export.meshing import Cleaning, distance_mesh
-from nerfloom.fields.distance import GridDistance
+from nerfloom.fields.distance import GridDistance, Shape
 from nerfloom.fields.surface import NeuSField, SurfaceField
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
@@ -526,13 +526,19 @@ def test_the_eikonal_term_counts_samples_and_the_whole_box(monkeypatch: pytest.M
     assert samples.features is not None
     unit = torch.nn.functional.normalize(samples.features[:, :3], dim=-1)
     longer = dataclasses.replace(samples, features=torch.cat([2 * unit, samples.features[:, 3:]], dim=-1))
-    asked, shape = [], field.shape
-    monkeypatch.setattr(field, "shape", lambda where: asked.append(where) or shape(where))
+    asked, shape = list[Tensor](), field.shape
+
+    def recorded(where: Tensor) -> Shape:
+        asked.append(where)
+        return shape(where)
+
+    monkeypatch.setattr(field, "shape", recorded)
     found = Eikonal()(dataclasses.replace(shown, rendered=dataclasses.replace(shown.rendered, samples=longer)))
     at_samples, elsewhere = len(samples) / EVERY, len(samples) // ANYWHERE
     assert elsewhere > 100
     assert [len(where) for where in asked] == [elsewhere]
-    assert float(found) == pytest.approx(at_samples / (at_samples + elsewhere), rel=0.01)  # type: ignore[arg-type]
+    assert found is not None
+    assert found.item() == pytest.approx(at_samples / (at_samples + elsewhere), rel=0.01)
     low, high = asked[0].amin(0), asked[0].amax(0)
     torch.testing.assert_close(torch.stack([low, high]), field.box, atol=0.1, rtol=0)
 

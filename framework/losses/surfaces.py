@@ -84,8 +84,8 @@ class Curvature(LossTerm):
     """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023).
 
     Some samples are compared with a position one sample's length away, in a random direction along the level set. The
-    term is the mean squared difference of the two unit normals. It applies after the fraction `curvature_from` of the
-    training budget.
+    term is the mean squared difference of the two unit normals. It applies from the fraction `curvature_from` to
+    the fraction `curvature_until` of the training budget.
     """
 
     def __init__(self) -> None:
@@ -94,8 +94,9 @@ class Curvature(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
         assert isinstance(field, SurfaceField)
-        early = field.progress < shown.model.config.curvature_from
-        if early or samples is None or samples.features is None or not len(samples):
+        config = shown.model.config
+        applies = config.curvature_from <= field.progress <= config.curvature_until
+        if not applies or samples is None or samples.features is None or not len(samples):
             return None
         some = some_of(len(samples))
         normals = safe_normalize(samples.features[some, :3])

@@ -26,6 +26,9 @@ EVERY, ANYWHERE = 4, 8
 """`Eikonal` uses one in `EVERY` samples, so that others may be without a gradient and are skipped. For each `ANYWHERE`
 samples it adds a random position in the box."""
 
+SMALLEST_CHANGE = 1e-3
+"""Difference of normals below which the curvature term is quadratic."""
+
 TRIED = 1024
 """Number of random positions in the box for `HiddenSpace`."""
 BEHIND = 0.03
@@ -84,7 +87,7 @@ class Curvature(LossTerm):
     """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023).
 
     Some samples are compared with a position one sample's length away, in a random direction along the level set. The
-    term is the mean squared difference of the two unit normals. It applies from the fraction `curvature_from` to
+    term is the mean difference of the two unit normals, so that edges count less than noise everywhere. It applies from the fraction `curvature_from` to
     the fraction `curvature_until` of the training budget.
     """
 
@@ -124,12 +127,12 @@ def tangents(normals: Tensor) -> Tensor:
 
 
 def normal_change(normals: Tensor, others: Tensor) -> Tensor:
-    """Return the mean squared difference () of unit normals; for an angle a between them it is 2 - 2 cos a.
+    """Return the mean difference () of unit normals; for an angle a between them it is 2 sin(a / 2).
 
     Args:
         normals, others: (N, 3).
     """
-    return (normals - others).square().sum(-1).mean()
+    return ((normals - others).square().sum(-1) + SMALLEST_CHANGE**2).sqrt().mean()
 
 
 class HiddenSpace(LossTerm):

@@ -16,6 +16,7 @@ from nerfloom.losses.functions import charbonnier, mean_squared_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import ColorError
 from nerfloom.renderable import parts
+from nerfloom.samplers.cells import places
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.scene.hidden_cells import HiddenCells
 
@@ -61,11 +62,20 @@ class Eikonal(LossTerm):
         if samples is None or samples.features is None or not len(samples):
             return None
         assert isinstance(field, SurfaceField)
-        unit = torch.rand(max(len(samples) // ANYWHERE, 1), 3, device=field.box.device)
-        low, high = field.box
-        elsewhere = field.shape(torch.lerp(low, high, unit)).gradients
+        elsewhere = field.shape(anywhere(max(len(samples) // ANYWHERE, 1), field, shown.model)).gradients
         gradients = torch.cat([samples.features[some_of(len(samples)), :3], elsewhere])
         return (gradients.norm(dim=-1) - 1).square().mean()
+
+
+def anywhere(count: int, field: SurfaceField, model: RayModel[Any]) -> Tensor:
+    """Return random positions (count, 3) in the box, in cells that silhouettes do not show to be empty."""
+    grids = parts(model, OccupancySampler)
+    kept = grids[0].kept()[1] if grids else None
+    unit = torch.rand(count, 3, device=field.box.device)
+    if kept is not None:
+        cells = kept[torch.randint(len(kept), (count,), device=kept.device)].long()
+        unit = (places(cells, grids[0].resolution)[:, 1:] + unit) / grids[0].resolution
+    return torch.lerp(*field.box, unit)
 
 
 class Silhouette(LossTerm):

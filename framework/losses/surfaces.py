@@ -23,9 +23,9 @@ from nerfloom.scene.hidden_cells import HiddenCells
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel
 
-EVERY, ANYWHERE = 4, 8
+EVERY, ANYWHERE, BENT = 8, 16, 32
 """`Eikonal` uses one in `EVERY` samples, so that others may be without a gradient and are skipped. For each `ANYWHERE`
-samples it adds a random position in the box."""
+samples it adds a random position in the box. `Curvature` uses one in `BENT` samples."""
 
 SMALLEST_CHANGE = 1e-3
 """Difference of normals below which the curvature term is quadratic."""
@@ -111,20 +111,20 @@ class Curvature(LossTerm):
         applies = config.curvature_from <= field.progress <= config.curvature_until
         if not applies or samples is None or samples.features is None or not len(samples):
             return None
-        some = some_of(len(samples))
+        some = some_of(len(samples), BENT)
         normals = safe_normalize(samples.features[some, :3])
         positions, lengths = samples.positions(shown.batch.rays)[some], samples.deltas[some]
         moved = positions + lengths[:, None] * tangents(normals.detach())
         return normal_change(normals, safe_normalize(field.shape(moved).gradients))
 
 
-def some_of(count: int) -> slice:
-    """Return one in `EVERY` of `count` samples, from a random one on; at least one sample.
+def some_of(count: int, every: int = EVERY) -> slice:
+    """Return one in `every` of `count` samples, from a random one on; at least one sample.
 
     Args:
         count: number of samples, at least 1.
     """
-    return slice(int(torch.randint(min(EVERY, count), ())), None, EVERY)
+    return slice(int(torch.randint(min(every, count), ())), None, every)
 
 
 def tangents(normals: Tensor) -> Tensor:

@@ -97,8 +97,8 @@ class Curvature(LossTerm):
     """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023).
 
     Some samples are compared with a position one sample's length away, in a random direction along the level set. The
-    term is the mean difference of the two unit normals, so that edges count less than noise everywhere. It applies from the fraction `curvature_from` to
-    the fraction `curvature_until` of the training budget.
+    term is the mean difference of the two unit normals, so that edges count less than noise everywhere. It applies
+    from the fraction `curvature_from` to the fraction `curvature_until` of the training budget.
     """
 
     def __init__(self) -> None:

@@ -61,8 +61,6 @@ SHARPER = 50.0
 """Upper bound of the inverse width just before the bound is lifted, relative to the first inverse width."""
 SAMPLES = {"hash-grid": 2**15, "frequency": 2**13}
 """Samples per training step with an occupancy grid."""
-COLOR_LAYERS = 4
-"""Hidden layers of the papers' colour network."""
 LEAST_ON_FLOOR, FLOOR_TOLERANCE = 0.05, 0.01
 """Minimum share of a reconstruction's points in the sphere that lie on a floor, and their maximum distance from it,
 radii of the sphere."""
@@ -94,6 +92,7 @@ class SurfaceConfig(
     """Samplers that suit the method."""
     RANGES: ClassVar[dict[str, Range]] = {
         "hidden_width": (1, 2**14),
+        "color_layers": (1, 16),
         "position_frequencies": (0, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
         "eikonal_loss_mult": AT_LEAST_0,
@@ -103,6 +102,7 @@ class SurfaceConfig(
         "hidden_loss_mult": AT_LEAST_0,
         "curvature_loss_mult": AT_LEAST_0,
         "curvature_from": (0, 1),
+        "curvature_until": (0, 1),
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
         "sharpness_learning_rate": AT_LEAST_0,
@@ -120,6 +120,8 @@ class SurfaceConfig(
     """Cells along an axis of the hash grid's finest level. auto: the next power of two that gives each pixel a cell."""
     hidden_width: Auto[int] = AUTO
     """Features per hidden layer of the two networks. auto: 64 on a hash grid, 256 for the papers' networks."""
+    color_layers: Auto[int] = AUTO
+    """Hidden layers of the colour network. auto: 1 on a hash grid, 4 for the papers' networks."""
     position_frequencies: int = 6
     """Number of frequencies in the encoding of positions (frequency)."""
     direction_frequencies: int = 4
@@ -142,6 +144,8 @@ class SurfaceConfig(
     """Weight of the change of normals along the surface."""
     curvature_from: float = 0.5
     """Fraction of the budget until --curvature-loss-mult applies: a surface has to find its place first."""
+    curvature_until: float = 1.0
+    """Fraction of the budget while --curvature-loss-mult applies: details of a surface come last."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""
@@ -177,6 +181,7 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
         config,
         Choice("learning_rate", 1e-2 if on_grid else 5e-4, suits),
         Choice("hidden_width", 64 if on_grid else 256, suits),
+        Choice("color_layers", 1 if on_grid else 4, suits),
     )
     config, cells = fill(config, finest_cells(scene))
     error, start, reason = "squared", 0.25, "nothing is behind the surfaces"
@@ -221,7 +226,7 @@ def surface_field(
         distance,
         sharpness(config.start_sharpness / distance.size, config.sharpness_learning_rate),
         config.hidden_width,
-        COLOR_LAYERS if large else 1,
+        config.color_layers,
         color_bias=large,
         direction_frequencies=config.direction_frequencies if large else None,
         appearance=appearance,
@@ -300,8 +305,7 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         # Meshes and crops cover the field's box.
         self.scene = replace(scene, box=foreground(config, scene).box)
         self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
-        edges = self.surface.box[1] - self.surface.box[0]
-        self.surface.cell = float((edges / config.grid_resolution).norm())
+        self.surface.resolution = config.grid_resolution
         self.register_buffer("step_scale", torch.tensor(1.0))
         self._step_scale = HostValue()
         grids, hides = parts(sampler, OccupancySampler), config.hidden_loss_mult > 0 and self.sphere is not None

@@ -61,6 +61,8 @@ SHARPER = 50.0
 """Upper bound of the inverse width just before the bound is lifted, relative to the first inverse width."""
 SAMPLES = {"hash-grid": 2**15, "frequency": 2**13}
 """Samples per training step with an occupancy grid."""
+COLOR_LAYERS = 4
+"""Hidden layers of the papers' colour network."""
 LEAST_ON_FLOOR, FLOOR_TOLERANCE = 0.05, 0.01
 """Minimum share of a reconstruction's points in the sphere that lie on a floor, and their maximum distance from it,
 radii of the sphere."""
@@ -92,7 +94,6 @@ class SurfaceConfig(
     """Samplers that suit the method."""
     RANGES: ClassVar[dict[str, Range]] = {
         "hidden_width": (1, 2**14),
-        "color_layers": (1, 16),
         "position_frequencies": (0, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
         "eikonal_loss_mult": AT_LEAST_0,
@@ -120,8 +121,6 @@ class SurfaceConfig(
     """Cells along an axis of the hash grid's finest level. auto: the next power of two that gives each pixel a cell."""
     hidden_width: Auto[int] = AUTO
     """Features per hidden layer of the two networks. auto: 64 on a hash grid, 256 for the papers' networks."""
-    color_layers: Auto[int] = AUTO
-    """Hidden layers of the colour network. auto: 1 on a hash grid, 4 for the papers' networks."""
     position_frequencies: int = 6
     """Number of frequencies in the encoding of positions (frequency)."""
     direction_frequencies: int = 4
@@ -181,7 +180,6 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
         config,
         Choice("learning_rate", 1e-2 if on_grid else 5e-4, suits),
         Choice("hidden_width", 64 if on_grid else 256, suits),
-        Choice("color_layers", 1 if on_grid else 4, suits),
     )
     config, cells = fill(config, finest_cells(scene))
     error, start, reason = "squared", 0.25, "nothing is behind the surfaces"
@@ -226,7 +224,7 @@ def surface_field(
         distance,
         sharpness(config.start_sharpness / distance.size, config.sharpness_learning_rate),
         config.hidden_width,
-        config.color_layers,
+        COLOR_LAYERS if large else 1,
         color_bias=large,
         direction_frequencies=config.direction_frequencies if large else None,
         appearance=appearance,

@@ -102,7 +102,6 @@ class SurfaceConfig(
         "bounds_loss_mult": AT_LEAST_0,
         "hidden_loss_mult": AT_LEAST_0,
         "curvature_loss_mult": AT_LEAST_0,
-        "curvature_from": (0, 1),
         "curvature_until": (0, 1),
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
@@ -141,10 +140,8 @@ class SurfaceConfig(
     Only with a background on a sphere, and with an occupancy grid."""
     curvature_loss_mult: float = 0.01
     """Weight of the change of normals along the surface."""
-    curvature_from: float = 0.5
-    """Fraction of the budget until --curvature-loss-mult applies: a surface has to find its place first."""
-    curvature_until: float = 1.0
-    """Fraction of the budget while --curvature-loss-mult applies: details of a surface come last."""
+    curvature_until: float = 0.4
+    """Fraction of the budget during which --curvature-loss-mult applies: details of a surface come last."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""

@@ -98,7 +98,7 @@ class Curvature(LossTerm):
 
     Some samples are compared with a position one sample's length away, in a random direction along the level set. The
     term is the mean difference of the two unit normals, so that edges count less than noise everywhere. It applies
-    from the fraction `curvature_from` to the fraction `curvature_until` of the training budget.
+    during the first fraction `curvature_until` of the training budget.
     """
 
     def __init__(self) -> None:
@@ -107,9 +107,8 @@ class Curvature(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
         assert isinstance(field, SurfaceField)
-        config = shown.model.config
-        applies = config.curvature_from <= field.progress <= config.curvature_until
-        if not applies or samples is None or samples.features is None or not len(samples):
+        late = field.progress > shown.model.config.curvature_until
+        if late or samples is None or samples.features is None or not len(samples):
             return None
         some = some_of(len(samples), BENT)
         normals = safe_normalize(samples.features[some, :3])

@@ -138,7 +138,7 @@ class SurfaceConfig(
     hidden_loss_mult: float = 0.1
     """Weight of positive distances where images look but no training ray arrives, below a floor or inside of things.
     Only with a background on a sphere, and with an occupancy grid."""
-    curvature_loss_mult: float = 0.01
+    curvature_loss_mult: float = 0.002
     """Weight of the change of normals along the surface."""
     curvature_until: float = 0.4
     """Fraction of the budget during which --curvature-loss-mult applies: details of a surface come last."""

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from nerfloom.base.config import AT_LEAST_0, Range
+from nerfloom.base.decisions import Choice
 from nerfloom.base.optimised import Optimised
+from nerfloom.data.scene import Scene
 from nerfloom.encodings.hash_grid import HashGridConfig
 
 
@@ -29,3 +31,15 @@ def grid_optimiser(config: GridsConfig, name: str = "grids") -> Optimised:
         name: name of the parameter group.
     """
     return Optimised(name, config.grid_learning_rate, betas=(0.9, 0.99), eps=1e-15, schedule="hold-exponential")
+
+
+def finest_cells(scene: Scene, per_pixel: int = 1) -> Choice:
+    """Return the cells along an axis at the finest level: the next power of two that gives each pixel enough.
+
+    Args:
+        scene: properties of the whole scene.
+        per_pixel: minimum number of cells per pixel of the images' longer side.
+    """
+    cells = 2 ** (per_pixel * scene.image_size - 1).bit_length()
+    reason = f"each of the images' {scene.image_size} pixels gets {per_pixel} or more"
+    return Choice("max_resolution", cells, reason, "finest cells along an axis")

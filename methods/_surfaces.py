@@ -39,6 +39,7 @@ from nerfloom.losses.surfaces import (
 )
 from nerfloom.losses.terms import KNOWN_DISTANCES, SamplerLoss
 from nerfloom.methods._captures import RefinedConfig, RefinedModel, refinement_choice
+from nerfloom.methods._grids import finest_cells
 from nerfloom.renderable import parts
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
@@ -101,7 +102,7 @@ class SurfaceConfig(
         "bounds_loss_mult": AT_LEAST_0,
         "hidden_loss_mult": AT_LEAST_0,
         "curvature_loss_mult": AT_LEAST_0,
-        "curvature_from": (0, 1),
+        "curvature_until": (0, 1),
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
         "sharpness_learning_rate": AT_LEAST_0,
@@ -115,6 +116,8 @@ class SurfaceConfig(
     the colour, for GPUs."""
     learning_rate: Auto[float] = AUTO
     """Initial learning rate of Adam. auto: 0.01 on a hash grid, 0.0005 for the papers' networks."""
+    max_resolution: Auto[int] = AUTO
+    """Cells along an axis of the hash grid's finest level. auto: the next power of two that gives each pixel a cell."""
     hidden_width: Auto[int] = AUTO
     """Features per hidden layer of the two networks. auto: 64 on a hash grid, 256 for the papers' networks."""
     position_frequencies: int = 6
@@ -124,7 +127,7 @@ class SurfaceConfig(
     color_loss: Auto[Literal["squared", "absolute"]] = AUTO
     """Error of colours. absolute: as in NeuS and VolSDF; edges and highlights that are still wrong count less, so that
     surfaces form where there is little texture. auto: absolute if there is a background, otherwise squared."""
-    eikonal_loss_mult: float = 0.01
+    eikonal_loss_mult: float = 0.003
     """Weight of the term that keeps the distance's gradient at length 1."""
     silhouette_loss_mult: float = 0.01
     """Weight of the difference between opacity and the images' alpha."""
@@ -135,10 +138,10 @@ class SurfaceConfig(
     hidden_loss_mult: float = 0.1
     """Weight of positive distances where images look but no training ray arrives, below a floor or inside of things.
     Only with a background on a sphere, and with an occupancy grid."""
-    curvature_loss_mult: float = 0.01
+    curvature_loss_mult: float = 0.002
     """Weight of the change of normals along the surface."""
-    curvature_from: float = 0.5
-    """Fraction of the budget until --curvature-loss-mult applies: a surface has to find its place first."""
+    curvature_until: float = 0.4
+    """Fraction of the budget during which --curvature-loss-mult applies: details of a surface come last."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""
@@ -150,7 +153,7 @@ class SurfaceConfig(
     """Length of a training step in widths of the surface, limited to one to four steps of --num-steps. 0: one step."""
     eval_rendering: Literal["volume", "surface"] = "volume"
     """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
-    sharpen_until: float = 0.8
+    sharpen_until: float = 0.3
     """Fraction of the budget until the upper bound of the inverse width has risen, exponentially, to 50 times the first
     value."""
     open_levels_until: float = 0.3
@@ -175,13 +178,14 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
         Choice("learning_rate", 1e-2 if on_grid else 5e-4, suits),
         Choice("hidden_width", 64 if on_grid else 256, suits),
     )
+    config, cells = fill(config, finest_cells(scene))
     error, start, reason = "squared", 0.25, "nothing is behind the surfaces"
     if config.background_model == "sphere":
         error, start, reason = "absolute", 0.5, "a background could explain what has no texture"
     color = Choice("color_loss", error, reason, "error of colours")
     radius = Choice("start_radius", start, reason, "radius of the first ball")
     config, own = fill(config, color, radius, refinement_choice(scene, marched=False))
-    return config, made + samples + own
+    return config, made + samples + (cells if on_grid else []) + own
 
 
 def make_distance(config: SurfaceConfig, box: Tensor) -> Distance:
@@ -296,8 +300,7 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         # Meshes and crops cover the field's box.
         self.scene = replace(scene, box=foreground(config, scene).box)
         self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
-        edges = self.surface.box[1] - self.surface.box[0]
-        self.surface.cell = float((edges / config.grid_resolution).norm())
+        self.surface.resolution = config.grid_resolution
         self.register_buffer("step_scale", torch.tensor(1.0))
         self._step_scale = HostValue()
         grids, hides = parts(sampler, OccupancySampler), config.hidden_loss_mult > 0 and self.sphere is not None

@@ -22,6 +22,7 @@ from nerfloom.fields.inverted import InvertedField
 from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, SamplerLoss
+from nerfloom.methods._grids import finest_cells
 from nerfloom.ray_model import RayModel
 from nerfloom.rendering.background import background_renderer
 from nerfloom.samplers.background import BackgroundConfig, decide_background, foreground
@@ -188,16 +189,10 @@ def decide(config: InstantNGPConfig, scene: Scene) -> tuple[InstantNGPConfig, li
         Choice("thin_gradients", suited.thin, suits, "gradients thinned, of the mean"),
     )
     config, _ = fill(config, Choice("detail", suited.detail, suits))  # reported with the resolution below
-    finest = 2 ** (config.detail * scene.image_size - 1).bit_length()
     pays = config.log2_table_size >= MIN_SPARSE_TABLE
     config, more = fill(
         config,
-        Choice(
-            "max_resolution",
-            finest,
-            f"each of the images' {scene.image_size} pixels gets {config.detail} or more",
-            "finest cells along an axis",
-        ),
+        finest_cells(scene, config.detail),
         Choice("sparse_updates", pays, f"tables have 2^{config.log2_table_size} entries a level"),
     )
     config, few = decide_few_images(config, scene)

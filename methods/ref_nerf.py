@@ -22,6 +22,7 @@ from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.kernels.encodings.integrated_directional import MAX_BANDS
 from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
+from nerfloom.methods._grids import finest_cells
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge
 
@@ -110,9 +111,7 @@ def decide(config: RefNeRFConfig, scene: Scene) -> tuple[RefNeRFConfig, list[Dec
         Choice("bottleneck_width", 16 if on_grid else 128, reason),
         Choice("normal_loss_mult", 3e-3 if on_grid else 3e-4, reason),
     )
-    finest = 2 ** (scene.image_size - 1).bit_length()
-    each = f"each of the images' {scene.image_size} pixels gets one or more"
-    config, cells = fill(config, Choice("max_resolution", finest, each, "finest cells along an axis"))
+    config, cells = fill(config, finest_cells(scene))
     return config, made + samples + (cells if on_grid else [])
 
 

@@ -16,15 +16,19 @@ from nerfloom.losses.functions import charbonnier, mean_squared_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import ColorError
 from nerfloom.renderable import parts
+from nerfloom.samplers.cells import places
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.scene.hidden_cells import HiddenCells
 
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel
 
-EVERY, ANYWHERE = 4, 8
+EVERY, ANYWHERE, BENT = 8, 16, 32
 """`Eikonal` uses one in `EVERY` samples, so that others may be without a gradient and are skipped. For each `ANYWHERE`
-samples it adds a random position in the box."""
+samples it adds a random position in the box. `Curvature` uses one in `BENT` samples."""
+
+SMALLEST_CHANGE = 1e-3
+"""Difference of normals below which the curvature term is quadratic."""
 
 TRIED = 1024
 """Number of random positions in the box for `HiddenSpace`."""
@@ -58,11 +62,20 @@ class Eikonal(LossTerm):
         if samples is None or samples.features is None or not len(samples):
             return None
         assert isinstance(field, SurfaceField)
-        unit = torch.rand(max(len(samples) // ANYWHERE, 1), 3, device=field.box.device)
-        low, high = field.box
-        elsewhere = field.shape(torch.lerp(low, high, unit)).gradients
+        elsewhere = field.shape(anywhere(max(len(samples) // ANYWHERE, 1), field, shown.model)).gradients
         gradients = torch.cat([samples.features[some_of(len(samples)), :3], elsewhere])
         return (gradients.norm(dim=-1) - 1).square().mean()
+
+
+def anywhere(count: int, field: SurfaceField, model: RayModel[Any]) -> Tensor:
+    """Return random positions (count, 3) in the box, in cells that silhouettes do not show to be empty."""
+    grids = parts(model, OccupancySampler)
+    kept = grids[0].kept()[1] if grids else None
+    unit = torch.rand(count, 3, device=field.box.device)
+    if kept is not None:
+        cells = kept[torch.randint(len(kept), (count,), device=kept.device)].long()
+        unit = (places(cells, grids[0].resolution)[:, 1:] + unit) / grids[0].resolution
+    return torch.lerp(*field.box, unit)
 
 
 class Silhouette(LossTerm):
@@ -84,8 +97,8 @@ class Curvature(LossTerm):
     """Change of normals along the surface: PermutoSDF (Rosu and Behnke 2023).
 
     Some samples are compared with a position one sample's length away, in a random direction along the level set. The
-    term is the mean squared difference of the two unit normals. It applies after the fraction `curvature_from` of the
-    training budget.
+    term is the mean difference of the two unit normals, so that edges count less than noise everywhere. It applies
+    during the first fraction `curvature_until` of the training budget.
     """
 
     def __init__(self) -> None:
@@ -94,23 +107,23 @@ class Curvature(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
         assert isinstance(field, SurfaceField)
-        early = field.progress < shown.model.config.curvature_from
-        if early or samples is None or samples.features is None or not len(samples):
+        late = field.progress > shown.model.config.curvature_until
+        if late or samples is None or samples.features is None or not len(samples):
             return None
-        some = some_of(len(samples))
+        some = some_of(len(samples), BENT)
         normals = safe_normalize(samples.features[some, :3])
         positions, lengths = samples.positions(shown.batch.rays)[some], samples.deltas[some]
         moved = positions + lengths[:, None] * tangents(normals.detach())
         return normal_change(normals, safe_normalize(field.shape(moved).gradients))
 
 
-def some_of(count: int) -> slice:
-    """Return one in `EVERY` of `count` samples, from a random one on; at least one sample.
+def some_of(count: int, every: int = EVERY) -> slice:
+    """Return one in `every` of `count` samples, from a random one on; at least one sample.
 
     Args:
         count: number of samples, at least 1.
     """
-    return slice(int(torch.randint(min(EVERY, count), ())), None, EVERY)
+    return slice(int(torch.randint(min(every, count), ())), None, every)
 
 
 def tangents(normals: Tensor) -> Tensor:
@@ -123,12 +136,12 @@ def tangents(normals: Tensor) -> Tensor:
 
 
 def normal_change(normals: Tensor, others: Tensor) -> Tensor:
-    """Return the mean squared difference () of unit normals; for an angle a between them it is 2 - 2 cos a.
+    """Return the mean difference () of unit normals; for an angle a between them it is 2 sin(a / 2).
 
     Args:
         normals, others: (N, 3).
     """
-    return (normals - others).square().sum(-1).mean()
+    return ((normals - others).square().sum(-1) + SMALLEST_CHANGE**2).sqrt().mean()
 
 
 class HiddenSpace(LossTerm):

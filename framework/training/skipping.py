@@ -99,7 +99,8 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
                 everywhere, all_count = _probe(model, rays)
     nested = any(s.levels > 1 for s in samplers)
     where = "all cells" if nested else "the box"
-    rungs = [Rung("cells, empty", empty, None, "no switch", f"empty space: {empty:.0%} of {where} is never sampled")]
+    no_cells = "no switch" if nested else "--grid-resolution 1"
+    rungs = [Rung("cells, empty", empty, None, no_cells, f"empty space: {empty:.0%} of {where} is never sampled")]
     if carved:
         says = f"{carved:.0%} of {where} from the first step, since the photographs show nothing there"
         switch = "--seen-cells False" if nested else "--silhouette-cells False"
@@ -109,14 +110,14 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
             "steps along a ray, in empty cells",
             1 - visible_count / max(all_count, 1),
             everywhere / unhidden,
-            "no switch",
+            no_cells,
             _along_rays("empty space along rays", all_count, visible_count, everywhere / unhidden),
         ),
         Rung(
             "the samples left, hidden",
             1 - count / max(visible_count, 1),
             unhidden / usual,
-            "--early-stop 0",
+            "--early-stop 0 --train-early-stop 0",
             _along_rays("behind opaque surfaces", visible_count, count, unhidden / usual),
         ),
     ]

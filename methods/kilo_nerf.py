@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from nerfloom import Dataset, Decision, Field, Method, RayModel, Renderer, Sampler, Scene
@@ -19,12 +20,17 @@ from nerfloom.fields.network_grid import NetworkGrid
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, SamplerLoss
+from nerfloom.renderable import parts
+from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.choice import SamplingConfig, contracted_box, decide_sampler, decide_samples, make_sampler
-from nerfloom.training.distillation import distil
+from nerfloom.training.distillation import MatterPoints, distil, length_in
 from nerfloom.training.teacher import Teacher
 
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
+FITS_MATTER = True
+"""Whether the networks of a scene with a box share the box around the teacher's matter, as in the paper, instead of the
+scene's."""
 
 
 @dataclass(frozen=True)
@@ -117,11 +123,27 @@ class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
         """Learn the teacher's field, if there is a teacher.
 
         Args:
-            dataset: the training images; not used.
+            dataset: the training images.
         """
         if self.teacher is not None:
+            box = self.scene.box.to(self.device)
+            matter = MatterPoints(self.teacher, box, length_in(box)).around() if FITS_MATTER else None
+            if matter is not None and not self.scene.unbounded:
+                self._keep_to(matter)
+                box = matter
             seconds = self.config.distill_share * (self.config.max_seconds or math.inf)
-            distil(self, self.teacher, self.config.distill_steps, seconds)
+            distil(self, self.teacher, dataset, box, self.config.distill_steps, seconds)
+
+    def _keep_to(self, box: Tensor) -> None:
+        """Move all networks into a `box` (2, 3) of the scene, and never sample outside of it."""
+        assert isinstance(self.field, NetworkGrid)
+        self.field.move_to(box)
+        for grid in parts(self.sampler, SkipsCells):
+            edges = torch.arange(grid.resolution + 1, device=box.device) / grid.resolution
+            sides = torch.lerp(grid.box[0], grid.box[1], edges[:, None])  # of the cells, (n + 1, 3)
+            x, y, z = ((sides[1:] > box[0]) & (sides[:-1] < box[1])).unbind(-1)
+            inside = (x[:, None, None] & y[:, None] & z).flatten()
+            grid.carve((~grid.carved.view(grid.slices, -1) & inside).flatten())
 
     def before_step(self, step: int, progress: float) -> None:
         """Release the teacher, also where a resumed model did not need it, and update the sampler for `step`."""

@@ -45,6 +45,8 @@ MAX_UNBOUNDED_RESOLUTION = 256
 CELLS_PER_PIXEL = 1.28
 """Cells along the longest edge, if no number is given, relative to the pixels along the images' longer side. Images do
 not see each of much smaller cells, and pictures from elsewhere have holes."""
+AVERAGED = True
+"""Whether a leaf starts with the mean of its eighths, instead of its centre."""
 
 
 @dataclass(frozen=True)
@@ -110,13 +112,14 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
     pixels = int(CELLS_PER_PIXEL * model.scene.image_size)
     most = MAX_UNBOUNDED_RESOLUTION if model.scene.unbounded else MAX_RESOLUTION
     resolution = settings.resolution or min(max(pixels, MIN_RESOLUTION), most)
-    layout, raw, seen = _visible(model, dataset, resolution)
+    search = MatterSearch(model)
+    layout, raw, seen = _visible(model, search, dataset, resolution)
     while settings.resolution is None and resolution > MIN_RESOLUTION:
         if not is_too_fine(seen.largest, settings.max_bytes, degrees):
             break
         resolution //= 2
         say(f"half of these would not fit; {resolution} cells along the longest edge instead")
-        layout, raw, seen = _visible(model, dataset, resolution)
+        layout, raw, seen = _visible(model, search, dataset, resolution)
     degree, kept = chosen(seen.largest, settings.max_bytes, degrees)
     visible = len(visible_leaves(seen.largest))
     if len(kept) < visible:
@@ -124,12 +127,16 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
     layout, rows = layout.part(kept)
     raw, seen = raw[rows], seen.part(rows)
     say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, cells of {layout.cell:.3g} scene units")
+    depths, places = depths_of(raw[:, 0]), layout.centers()
+    if AVERAGED:
+        depths, places = search.averaged(layout, depths)
+        raw = raw_of(depths)[:, None]
     firsts, fitted = layout.firsts_of_levels, list[Tensor]()
     for level, first, end in zip(layout.levels, firsts, firsts[1:], strict=False):
         if first < end:
-            centers, part = level.within([]).centers(), seen.part(torch.arange(first, end))
-            fitted.append(fitted_colors(field_colors(model, centers, level.cell), centers, part, degree))
-    coefficients, depths = torch.cat(fitted), depths_of(raw[:, 0])
+            own, part = places[first:end], seen.part(torch.arange(first, end))
+            fitted.append(fitted_colors(field_colors(model, own, level.cell), own, part, degree))
+    coefficients = torch.cat(fitted)
     if settings.seconds > 0:
         depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
     return layout, depths, coefficients
@@ -154,9 +161,10 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
     return model
 
 
-def _visible(model: RayModel[Any], dataset: Dataset, resolution: int) -> tuple[OctreeLayout, Tensor, Seen]:
+def _visible(
+    model: RayModel[Any], search: MatterSearch, dataset: Dataset, resolution: int
+) -> tuple[OctreeLayout, Tensor, Seen]:
     """Return cells with matter, their raw densities (L, 1), and how training images see them."""
-    search = MatterSearch(model)
     grids = search.grids(resolution)
     layout, depths = search.layout(grids)
     if not layout.num_leaves:

@@ -50,6 +50,10 @@ class OctreeConfig(
     degree: int = 1
     """Degree of the harmonics of colours, 0 to 3."""
 
+    images_per_batch = 2
+    """Number of images with the rays of a step. Neighbouring rays meet leaves that are close together in memory, and a
+    leaf of about a pixel is met by about one ray of a step, from whichever image."""
+
 
 OctreeConfigT = TypeVar("OctreeConfigT", bound=OctreeConfig)
 

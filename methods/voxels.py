@@ -92,6 +92,8 @@ class VoxelsConfig(
     silhouette_pixels: bool = True
     """Never draw pixels if their ray passes only through such empty space."""
 
+    images_per_batch = 0  # large leaves are met by many rays of a step, which should be from many directions
+
 
 def decide(config: VoxelsConfig, scene: Scene) -> tuple[VoxelsConfig, list[Decision]]:
     """Fill in the resolution."""

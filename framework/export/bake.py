@@ -20,7 +20,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.octree_cells import MatterSearch
 from nerfloom.export.octree_colors import Seen, field_colors, fitted_colors, seen_leaves
-from nerfloom.export.octree_size import DEGREES, chosen, is_too_fine, room_for, visible_leaves
+from nerfloom.export.octree_size import BITS, DEGREES, chosen, is_too_fine, room_for, visible_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.method import Method
@@ -77,7 +77,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     layout, depths, coefficients = (
         _as_learnt(model, loaded, settings) if isinstance(model, DrawsOctree) else _baked(loaded, settings)
     )
-    leaves, lost = packed(depths, coefficients)
+    leaves, lost = packed(depths, coefficients, BITS)
     leaves = replace(leaves, table=leaves.table.repeat(len(layout.levels)))
     say(f"rounded to bytes: opacities of cells by {lost.opacity:.2g}, colours by {lost.color:.2g} (root mean square)")
     scene = model.scene

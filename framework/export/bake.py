@@ -47,8 +47,6 @@ CELLS_PER_PIXEL = 1.28
 not see each of much smaller cells, and pictures from elsewhere have holes."""
 AVERAGED = True
 """Whether a leaf starts with the mean of its eighths, instead of its centre."""
-HARDLY = 1e-3
-"""Leaves with a smaller largest weight on training rays, by their centres, are left out before their eighths count."""
 
 
 @dataclass(frozen=True)
@@ -122,25 +120,27 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
         resolution //= 2
         say(f"half of these would not fit; {resolution} cells along the longest edge instead")
         layout, raw, seen = _visible(model, search, dataset, resolution)
-    places = layout.centers()
+    depths, places = depths_of(raw[:, 0]), layout.centers()
     if AVERAGED:
-        layout, rows = layout.part((seen.largest > HARDLY).nonzero()[:, 0])
-        depths, places = search.averaged(layout, depths_of(raw[rows, 0]))
+        shown, rows = layout.part(seen.largest.nonzero()[:, 0])
+        del seen  # it takes as much memory as the new one
+        depths[rows], places[rows] = search.averaged(shown, depths[rows])
         raw = raw_of(depths)[:, None]
+        # A surface that is less deep shows some of what its centres hide.
         seen = seen_leaves(layout, raw, dataset.cameras, model.scene.near, model.scene.far)
     degree, kept = chosen(seen.largest, settings.max_bytes, degrees)
     visible = len(visible_leaves(seen.largest))
     if len(kept) < visible:
         say(f"the size leaves room for {len(kept):,} of {visible:,} leaves: those with the largest weights")
     layout, rows = layout.part(kept)
-    raw, places, seen = raw[rows], places[rows], seen.part(rows)
+    raw, depths, places, seen = raw[rows], depths[rows], places[rows], seen.part(rows)
     say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, cells of {layout.cell:.3g} scene units")
     firsts, fitted = layout.firsts_of_levels, list[Tensor]()
     for level, first, end in zip(layout.levels, firsts, firsts[1:], strict=False):
         if first < end:
             own, part = places[first:end], seen.part(torch.arange(first, end))
             fitted.append(fitted_colors(field_colors(model, own, level.cell), own, part, degree))
-    coefficients, depths = torch.cat(fitted), depths_of(raw[:, 0])
+    coefficients = torch.cat(fitted)
     if settings.seconds > 0:
         depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
     return layout, depths, coefficients

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from nerfloom import Dataset, Decision, Field, Method, RayModel, Renderer, Sampler, Scene
-from nerfloom.base.config import AT_LEAST_0, Range
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill
 from nerfloom.fields.network_grid import NetworkGrid
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.term import LossTerm, RenderedBatch
@@ -28,6 +29,8 @@ from nerfloom.training.teacher import Teacher
 
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
+PAPER_FREQUENCIES = 10
+"""Maximum number of frequencies of positions, unless it is given."""
 FITS_MATTER = True
 """Whether the networks of a scene with a box share the box around the teacher's matter, as in the paper, instead of the
 scene's."""
@@ -64,8 +67,9 @@ class KiloNeRFConfig(
     """Features per hidden layer of a network."""
     num_layers: int = 2
     """Hidden layers before density and features; one more is for the colour."""
-    position_frequencies: int = 10
-    """Number of frequencies in the encoding of positions in a cell."""
+    position_frequencies: Auto[int] = AUTO
+    """Number of frequencies in the encoding of positions in a cell; 10 in the paper. auto: waves of two pixels or
+    more, if the images show the box from edge to edge."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions."""
     view_dependence_mult: float = 1e-6
@@ -155,7 +159,12 @@ def decide(config: KiloNeRFConfig, scene: Scene) -> tuple[KiloNeRFConfig, list[D
     """Fill in the settings that depend on the scene."""
     config, made = decide_sampler(config, scene)
     config, samples = decide_samples(config, SAMPLES)
-    return config, made + samples
+    # Frequency k is 2^k per half of a cell, and a cell has image_size / network_resolution pixels.
+    finest = math.log2(math.pi / 2 * scene.image_size / config.network_resolution)
+    count = min(max(math.floor(finest) + 1, 1), PAPER_FREQUENCIES)
+    reason = "finer waves are shorter than two pixels"
+    config, waves = fill(config, Choice("position_frequencies", count, reason, "frequencies of positions"))
+    return config, made + samples + waves
 
 
 def make_field(config: KiloNeRFConfig, scene: Scene) -> NetworkGrid:

@@ -41,12 +41,24 @@ def pupil(**settings: Any) -> KiloNeRF:
 def test_the_grid_follows_the_box() -> None:
     config, made = METHOD.decided(METHOD.config, SCENE)
     assert config.sampler == "occupancy"
-    assert [decision.option for decision in made] == ["sampler", "samples a step"]
+    assert [decision.option for decision in made] == ["sampler", "samples a step", "frequencies of positions"]
     flat = replace(SCENE, box=torch.tensor([[-1.0, -1.0, -0.25], [1.0, 1.0, 0.25]]))
     field = METHOD.build(METHOD.config, flat).field
     assert isinstance(field, NetworkGrid)
     assert field.cells == (8, 8, 2)
     assert METHOD.build(replace(METHOD.config, network_resolution=2), replace(SCENE, unbounded=True)).field.unbounded
+
+
+@pytest.mark.parametrize(
+    ("pixels", "cells", "count"), [(400, 8, 7), (400, 16, 6), (800, 16, 7), (9, 64, 1), (9999, 1, 10)]
+)
+def test_waves_are_two_pixels_long_or_longer(pixels: int, cells: int, count: int) -> None:
+    config = replace(METHOD.config, network_resolution=cells)
+    decided, _ = METHOD.decided(config, replace(SCENE, image_size=pixels))
+    assert decided.position_frequencies == count  # type: ignore[attr-defined]
+    shortest = 2 * math.pi / 2 ** (count - 1) * pixels / cells / 2  # pixels
+    assert shortest >= 2 or count == 1
+    assert shortest < 4 or count == 10
 
 
 def test_what_knows_the_direction_is_kept_small() -> None:

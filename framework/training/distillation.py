@@ -46,6 +46,9 @@ SEEN_SHARE, FRONT_SHARE = 0.85, 0.3
 """Share of the points on rays of cameras, and share of these anywhere in front of the surface. The other points on rays
 are at the surface: their distance to it is normally distributed, and its standard deviation is half of the length."""
 
+RATES = 1.0, 0.1
+"""Learning rate at the start, relative to the settings', and at the end, relative to the start."""
+
 
 @runtime_checkable
 class TakesTeacher(Protocol):
@@ -197,7 +200,10 @@ def distil(model: RayModel[Any], teacher: Teacher, dataset: Dataset, box: Tensor
     on_rays = round(SEEN_SHARE * POINTS) if len(seen.ends) else 0
     model.train()
     done, errors = 0, (math.nan, math.nan)
-    for _ in track(range(steps), "Learning the teacher's field", total=steps):
+    for step in track(range(steps), "Learning the teacher's field", total=steps):
+        spent = min(max(step / steps, (time.perf_counter() - begun) / max(seconds, 1e-9)), 1.0)
+        for group in optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * RATES[0] * RATES[1] ** spent
         positions = matter.draw(POINTS - on_rays)
         directions = seen.toward(positions) if on_rays else random_directions(len(positions), box)
         if on_rays:

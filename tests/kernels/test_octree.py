@@ -370,7 +370,7 @@ def test_compiled_at_extremes_is_the_reference() -> None:
     for there, given in ((layout, (raw, coefficients)), (nothing, (raw[:0], coefficients[:0]))):
         found = []
         for trace, kind in ((trace_octree, torch.float32), (trace_octree_reference, torch.float64)):
-            leaves = [part.to(kind).requires_grad_() for part in given]
+            leaves = [part.to(kind, copy=True).requires_grad_() for part in given]
             cast = rays if kind == torch.float32 else in_float64(rays)
             light = trace(there, *leaves, cast, background.to(kind))
             (light.color.sum() + light.opacity.sum()).backward()

@@ -7,6 +7,7 @@ import pytest
 from tests.forked import Forks
 
 MEASURE = """
+from contextlib import nullcontext
 from pathlib import Path
 import torch
 from nerfloom.data.scene import Scene
@@ -18,6 +19,9 @@ from nerfloom.testing.ball import cameras_at
 class Shell:
     scene = Scene(torch.tensor([[-1.0] * 3, [1.0] * 3]), 0.1, 9.0, 2, has_alpha=True, moving=False, image_size=64)
     device = torch.device("cpu")
+
+    def rendering(self):
+        return nullcontext()
 
     def density(self, points):
         return 500.0 * ((points.positions.norm(dim=-1) - 0.99).abs() < 1.5 / 512)
@@ -41,7 +45,7 @@ print(status("VmHWM") - before, layout.num_leaves, cells)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_512_cells_along_an_edge_need_less_memory_than_a_dense_grid(forks: Forks) -> None:
     """A shell of three cells: its leaves are found, seen and averaged in less memory than 512^3 numbers take."""
     try:

@@ -40,6 +40,8 @@ MATTER, MATTER_SHARE = 0.01, 0.75
 """Minimum opacity of matter over the length above, and share of the points of `MatterPoints` in cells with matter."""
 VIEWS, RAYS = 48, 2**19
 """Maximum number of cameras with rays that points are drawn on, and about the maximum number of these rays."""
+LOOKING = 0.2
+"""Maximum share of the time for finding where these rays end; a slow teacher shows fewer cameras."""
 OPAQUE = 0.5
 """Minimum opacity of a ray with a surface."""
 SEEN_SHARE, FRONT_SHARE = 0.85, 0.3
@@ -113,11 +115,12 @@ class SeenPoints:
         teacher: a teacher with a field.
         dataset: the training images.
         box: (2, 3) corners of the box that holds the points, the pupil's scene units; None for no box.
+        seconds: time after which no further camera is added.
     """
 
-    def __init__(self, teacher: Teacher, dataset: Dataset, box: Tensor | None) -> None:
-        cameras, scene = dataset.cameras, dataset.scene
-        chosen = strided(len(cameras), VIEWS)
+    def __init__(self, teacher: Teacher, dataset: Dataset, box: Tensor | None, seconds: float = math.inf) -> None:
+        cameras, scene, begun = dataset.cameras, dataset.scene, time.perf_counter()
+        chosen = [strided(len(cameras), VIEWS)[n] for n in torch.randperm(min(len(cameras), VIEWS)).tolist()]
         pixels = int((cameras.widths * cameras.heights)[chosen].sum())
         stride, black = max(math.isqrt(pixels // RAYS), 1), torch.zeros(3, device=cameras.fx.device)
         parts = list[tuple[Tensor, ...]]()
@@ -133,6 +136,8 @@ class SeenPoints:
             end = torch.where(opaque, torch.minimum(end, depth), end)
             kept = begin < end
             parts.append(tuple(each[kept] for each in (rays.origins, rays.directions, begin, end, opaque)))
+            if time.perf_counter() - begun > seconds:
+                break
         self.origins, self.directions, self.begins, self.ends, opaque = (
             torch.cat(each) for each in zip(*parts, strict=True)
         )
@@ -196,7 +201,7 @@ def distil(model: RayModel[Any], teacher: Teacher, dataset: Dataset, box: Tensor
     """
     begun, length = time.perf_counter(), length_in(box)
     matter, optimizer = MatterPoints(teacher, box, length), make_optimizer(model, model.config)
-    seen = SeenPoints(teacher, dataset, None if model.scene.unbounded else box)
+    seen = SeenPoints(teacher, dataset, None if model.scene.unbounded else box, LOOKING * seconds)
     on_rays = round(SEEN_SHARE * POINTS) if len(seen.ends) else 0
     model.train()
     done, errors = 0, (math.nan, math.nan)

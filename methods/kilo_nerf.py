@@ -11,20 +11,29 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from nerfloom import Dataset, Decision, Field, Method, RayModel, Renderer, Sampler, Scene
-from nerfloom.base.config import AT_LEAST_0, Range
+from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
+from nerfloom.base.decisions import Choice, fill
 from nerfloom.fields.network_grid import NetworkGrid
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, SamplerLoss
+from nerfloom.renderable import parts
+from nerfloom.samplers.base import SkipsCells
 from nerfloom.samplers.choice import SamplingConfig, contracted_box, decide_sampler, decide_samples, make_sampler
-from nerfloom.training.distillation import distil
+from nerfloom.training.distillation import MatterPoints, distil, length_in
 from nerfloom.training.teacher import Teacher
 
 SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
+PAPER_FREQUENCIES = 10
+"""Maximum number of frequencies of positions, unless it is given."""
+FITS_MATTER = True
+"""Whether the networks of a scene with a box share the box around the teacher's matter, as in the paper, instead of the
+scene's."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +67,9 @@ class KiloNeRFConfig(
     """Features per hidden layer of a network."""
     num_layers: int = 2
     """Hidden layers before density and features; one more is for the colour."""
-    position_frequencies: int = 10
-    """Number of frequencies in the encoding of positions in a cell."""
+    position_frequencies: Auto[int] = AUTO
+    """Number of frequencies in the encoding of positions in a cell; 10 in the paper. auto: waves of two pixels or
+    more, if the images show the box from edge to edge."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions."""
     view_dependence_mult: float = 1e-6
@@ -117,11 +127,27 @@ class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
         """Learn the teacher's field, if there is a teacher.
 
         Args:
-            dataset: the training images; not used.
+            dataset: the training images.
         """
         if self.teacher is not None:
+            box = self.scene.box.to(self.device)
+            matter = MatterPoints(self.teacher, box, length_in(box)).around() if FITS_MATTER else None
+            if matter is not None and not self.scene.unbounded:
+                self._keep_to(matter)
+                box = matter
             seconds = self.config.distill_share * (self.config.max_seconds or math.inf)
-            distil(self, self.teacher, self.config.distill_steps, seconds)
+            distil(self, self.teacher, dataset, box, self.config.distill_steps, seconds)
+
+    def _keep_to(self, box: Tensor) -> None:
+        """Move all networks into a `box` (2, 3) of the scene, and never sample outside of it."""
+        assert isinstance(self.field, NetworkGrid)
+        self.field.move_to(box)
+        for grid in parts(self.sampler, SkipsCells):
+            edges = torch.arange(grid.resolution + 1, device=box.device) / grid.resolution
+            sides = torch.lerp(grid.box[0], grid.box[1], edges[:, None])  # of the cells, (n + 1, 3)
+            x, y, z = ((sides[1:] > box[0]) & (sides[:-1] < box[1])).unbind(-1)
+            inside = (x[:, None, None] & y[:, None] & z).flatten()
+            grid.carve((~grid.carved.view(grid.slices, -1) & inside).flatten())
 
     def before_step(self, step: int, progress: float) -> None:
         """Release the teacher, also where a resumed model did not need it, and update the sampler for `step`."""
@@ -133,7 +159,12 @@ def decide(config: KiloNeRFConfig, scene: Scene) -> tuple[KiloNeRFConfig, list[D
     """Fill in the settings that depend on the scene."""
     config, made = decide_sampler(config, scene)
     config, samples = decide_samples(config, SAMPLES)
-    return config, made + samples
+    # Frequency k is 2^k per half of a cell, and a cell has image_size / network_resolution pixels.
+    finest = math.log2(math.pi / 2 * scene.image_size / config.network_resolution)
+    count = min(max(math.floor(finest) + 1, 1), PAPER_FREQUENCIES)
+    reason = "finer waves are shorter than two pixels"
+    config, waves = fill(config, Choice("position_frequencies", count, reason, "frequencies of positions"))
+    return config, made + samples + waves
 
 
 def make_field(config: KiloNeRFConfig, scene: Scene) -> NetworkGrid:

@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from nerfloom import ConfigError, Dataset, Decision, Loss, Method, PixelBatch, Rays, RowChange, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
@@ -51,6 +52,9 @@ COLOR_VARIATION = 0.1
 RAYS_PER_LOOK = 8
 """One training ray out of this number is followed to its end. It also meets leaves behind others, which are then known
 to be hidden."""
+PLAIN_UNTIL_LAST = True
+"""Whether colours depend on the direction only after the last split. Few values are faster and need fewer rays:
+SVRaster's settings for NeRF-Synthetic begin with degree 0 too."""
 UNUSED = ("depth_loss_mult", "free_space_loss_mult", "thin_gradients", "gradient_scaling")
 """Settings of other methods that cast rays, which have no meaning here."""
 
@@ -91,6 +95,8 @@ class VoxelsConfig(
     """Place no leaf where an image's alpha channel shows empty space."""
     silhouette_pixels: bool = True
     """Never draw pixels if their ray passes only through such empty space."""
+
+    images_per_batch = 0  # large leaves are met by many rays of a step, which should be from many directions
 
 
 def decide(config: VoxelsConfig, scene: Scene) -> tuple[VoxelsConfig, list[Decision]]:
@@ -163,7 +169,8 @@ class Voxels(OctreeModel[VoxelsConfig]):
         """Set grey fog in a grid with a number of `cells` along the longest edge."""
         layout = self.hull.leaves(cells)
         raw = raw_of(layout.origin.new_full((layout.num_leaves, 1), FOG / cells))
-        coefficients = layout.origin.new_zeros(layout.num_leaves, 3, (self.config.degree + 1) ** 2)
+        degree = 0 if PLAIN_UNTIL_LAST and self.config.num_splits else self.config.degree
+        coefficients = layout.origin.new_zeros(layout.num_leaves, 3, (degree + 1) ** 2)
         coefficients[..., 0] = 0.5 / CONSTANT
         self.set_octree(layout, raw, coefficients.flatten(1))
 
@@ -225,7 +232,12 @@ class Voxels(OctreeModel[VoxelsConfig]):
         if not splits:
             return [RowChange(table, rows) for table in tables]
         # An edge is half as long, so half as deep. Rows are new for Adam: gradients of smaller leaves are smaller.
-        values = raw_of(self.depths(rows) / 2)[:, None], self.coefficients()[rows]
+        colors = self.coefficients()[rows].unflatten(1, (3, -1))
+        if not any(split for _, split in self._moments[done + 1 :]):
+            terms = (self.config.degree + 1) ** 2
+            colors = functional.pad(colors, (0, terms - colors.shape[2]))
+            self.colors.table.data = colors.new_zeros(0, 3 * terms)
+        values = raw_of(self.depths(rows) / 2)[:, None], colors.flatten(1)
         return [RowChange(table, kept[:0], fresh) for table, fresh in zip(tables, values, strict=True)]
 
 

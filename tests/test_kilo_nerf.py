@@ -20,11 +20,11 @@ from nerfloom.methods.kilo_nerf import METHOD, KiloNeRF
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training import distillation
 from nerfloom.training.checkpoint import load_checkpoint
-from nerfloom.training.distillation import MatterPoints, distil, point_errors, random_directions
+from nerfloom.training.distillation import MatterPoints, SeenPoints, distil, length_in, point_errors, random_directions
 from nerfloom.training.teacher import Teacher
 from tests.other_device import OTHER, other_device
 from tests.training.helpers import TINY, tiny_trainer
-from tests.training.taught import BOX, marble
+from tests.training.taught import BOX, SHARP, THICK, marble
 
 SCENE = Scene(BOX, 1.0, 5.0, num_cameras=8, has_alpha=True, moving=False, image_size=24)
 IDENTITY = Placement.of(None, 1.0)
@@ -41,12 +41,24 @@ def pupil(**settings: Any) -> KiloNeRF:
 def test_the_grid_follows_the_box() -> None:
     config, made = METHOD.decided(METHOD.config, SCENE)
     assert config.sampler == "occupancy"
-    assert [decision.option for decision in made] == ["sampler", "samples a step"]
+    assert [decision.option for decision in made] == ["sampler", "samples a step", "frequencies of positions"]
     flat = replace(SCENE, box=torch.tensor([[-1.0, -1.0, -0.25], [1.0, 1.0, 0.25]]))
     field = METHOD.build(METHOD.config, flat).field
     assert isinstance(field, NetworkGrid)
     assert field.cells == (8, 8, 2)
     assert METHOD.build(replace(METHOD.config, network_resolution=2), replace(SCENE, unbounded=True)).field.unbounded
+
+
+@pytest.mark.parametrize(
+    ("pixels", "cells", "count"), [(400, 8, 7), (400, 16, 6), (800, 16, 7), (9, 64, 1), (9999, 1, 10)]
+)
+def test_waves_are_two_pixels_long_or_longer(pixels: int, cells: int, count: int) -> None:
+    config = replace(METHOD.config, network_resolution=cells)
+    decided, _ = METHOD.decided(config, replace(SCENE, image_size=pixels))
+    assert decided.position_frequencies == count  # type: ignore[attr-defined]
+    shortest = 2 * math.pi / 2 ** (count - 1) * pixels / cells / 2  # pixels
+    assert shortest >= 2 or count == 1
+    assert shortest < 4 or count == 10
 
 
 def test_what_knows_the_direction_is_kept_small() -> None:
@@ -101,13 +113,63 @@ def test_without_matter_points_are_anywhere() -> None:
     assert float((points.square().mean(0) - 1 / 3).abs().max()) < 0.02
 
 
+def test_points_are_where_photographs_look() -> None:
+    """A ray through the marble has half of its light left at a distance that the closed form knows."""
+    torch.manual_seed(0)
+    dataset, length = ball_in_a_box(), length_in(BOX)
+    seen = SeenPoints(Teacher(marble(), IDENTITY, IDENTITY), dataset, BOX)
+    origins, directions, ends = (each[seen.surfaces].double() for each in (seen.origins, seen.directions, seen.ends))
+    # The density is Gaussian along a ray: the error function integrates it.
+    nearest = -(origins * directions).sum(-1)
+    away = (origins + nearest[:, None] * directions).square().sum(-1)
+    depth = THICK * torch.exp(-SHARP * away) * math.sqrt(math.pi / SHARP) / 2
+    passed = depth * (1 + torch.erf(math.sqrt(SHARP) * (ends - nearest)))
+    assert float((torch.exp(-passed) - 0.5).abs().mean()) < 0.1  # the teacher has 64 samples on a ray
+    positions, ahead = seen.draw(20_000, length)
+    torch.testing.assert_close(ahead.norm(dim=-1), torch.ones(20_000))
+    assert bool((positions.abs() < 1 + 2 * length).all())
+    # No point is far behind the surface that its ray meets first.
+    marble_ahead = -(positions * ahead).sum(-1)
+    assert float((marble_ahead > -length).float().mean()) > 0.7
+    from_camera = positions - dataset.cameras.camera_to_worlds[:, None, :, 3]
+    cosines = torch.nn.functional.cosine_similarity(from_camera, ahead.expand_as(from_camera), dim=-1)
+    assert float(cosines.amax(0).min()) > 1 - 1e-5
+    toward = seen.toward(positions)
+    cosines = torch.nn.functional.cosine_similarity(from_camera, toward.expand_as(from_camera), dim=-1)
+    assert float(cosines.amax(0).min()) > 1 - 1e-5
+
+
+def test_networks_share_the_box_of_the_matter() -> None:
+    """The marble's opacity over the length is above a hundredth within 0.45 of its centre."""
+    torch.manual_seed(0)
+    model = pupil(distill_steps=1)
+    model.take_teacher(Teacher(marble(), IDENTITY, IDENTITY))
+    model.start(ball_in_a_box())
+    edge = 2 / distillation.CELLS
+    box = model.field.box
+    assert bool((box[1] >= 0.45).all())
+    assert bool((box[0] <= -0.45).all())
+    assert float(box.abs().max()) <= 0.47 + 2 * edge
+    model.eval()
+    _, places = model.field.located(box)
+    torch.testing.assert_close(places, torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    rays = ball_in_a_box().cameras.pixel_rays(torch.arange(500), 0.0, 9.0)
+    samples = model.sampler.sample(rays, model.field, jitter=False)
+    positions = rays.origins[samples.ray_indices] + samples.t[:, None] * rays.directions[samples.ray_indices]
+    assert len(positions)
+    cell = 2 / model.config.grid_resolution
+    assert bool(((positions > box[0] - cell) & (positions < box[1] + cell)).all())
+
+
 @pytest.mark.medium
 def test_a_pupil_learns_the_teachers_field(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pupil has another frame than the teacher, and is compared with the closed form."""
     monkeypatch.setattr(distillation, "POINTS", 2048)
     model, own = pupil(), Placement.of(torch.tensor([[0.0, -1, 0, 0.1], [1, 0, 0, 0], [0, 0, 1, 0]]), 1.25)
-    teacher = Teacher(marble(), own, IDENTITY)
-    positions, directions = torch.rand(4000, 3) - 0.5, random_directions(4000, BOX)
+    teacher, dataset = Teacher(marble(), own, IDENTITY), ball_in_a_box()
+    seen = SeenPoints(teacher, dataset, BOX)
+    assert len(seen.surfaces)
+    positions, directions = seen.draw(4000, length_in(BOX))
     true = teacher.at_points(positions, directions, 0.03)
 
     def errors() -> float:
@@ -117,7 +179,7 @@ def test_a_pupil_learns_the_teachers_field(monkeypatch: pytest.MonkeyPatch) -> N
         return float(sum(found))
 
     before = errors()
-    distil(model, teacher, 200, math.inf)
+    distil(model, teacher, dataset, BOX, 200, math.inf)
     print(f"errors at points {before:.4f} -> {errors():.4f}")
     assert errors() < before / 3
 
@@ -127,7 +189,7 @@ def test_learning_at_points_ends_with_its_time(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(distillation, "CELLS", 8)
     model = pupil()
     before = [parameter.detach().clone() for parameter in model.field.parameters()]
-    distil(model, Teacher(marble(), IDENTITY, IDENTITY), 10**6, 0.0)
+    distil(model, Teacher(marble(), IDENTITY, IDENTITY), ball_in_a_box(), BOX, 10**6, 0.0)
     moved = [not torch.equal(a, b) for a, b in zip(before, model.field.parameters(), strict=True)]
     assert all(moved)
 
@@ -140,7 +202,14 @@ def test_a_field_is_learnt_on_another_device_too(monkeypatch: pytest.MonkeyPatch
     with other_device():
         model = pupil().to(OTHER)
         before = [parameter.detach().clone() for parameter in model.field.parameters()]
-        distil(model, Teacher(marble().to(OTHER), IDENTITY, IDENTITY), 2, math.inf)
+        distil(
+            model,
+            Teacher(marble().to(OTHER), IDENTITY, IDENTITY),
+            ball_in_a_box().to(OTHER),
+            BOX.to(OTHER),
+            2,
+            math.inf,
+        )
         moved = [bool((a != b).any()) for a, b in zip(before, model.field.parameters(), strict=True)]
     assert all(moved)
 

@@ -87,6 +87,7 @@ def test_pixels_of_few_images_are_drawn_evenly(dataset: Dataset) -> None:
     for data, images in ((dataset, 10), (replace(dataset, drawn=some), 2), (replace(dataset, drawn=some.listed()), 2)):
         torch.manual_seed(0)
         drawn = [draw_from_images(data, 100, 2) for _ in range(1000)]
+        assert all(bool((pixels.diff() >= 0).all()) for pixels in drawn)
         owners = [torch.unique(pixels // 400, return_counts=True) for pixels in drawn]
         assert {tuple(counts.tolist()) for _, counts in owners} == {(50, 50), (100,)}
         counts = torch.bincount(torch.cat([numbers.repeat(3 - len(numbers)) for numbers, _ in owners]), minlength=10)

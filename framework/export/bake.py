@@ -20,7 +20,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
 from nerfloom.export.octree_cells import MatterSearch
 from nerfloom.export.octree_colors import Seen, field_colors, fitted_colors, seen_leaves
-from nerfloom.export.octree_size import DEGREES, chosen, is_too_fine, room_for, visible_leaves
+from nerfloom.export.octree_size import BITS, DEGREES, chosen, is_too_fine, room_for, visible_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.method import Method
@@ -45,6 +45,8 @@ MAX_UNBOUNDED_RESOLUTION = 256
 CELLS_PER_PIXEL = 1.28
 """Cells along the longest edge, if no number is given, relative to the pixels along the images' longer side. Images do
 not see each of much smaller cells, and pictures from elsewhere have holes."""
+AVERAGED = True
+"""Whether a leaf starts with the mean of its eighths, instead of its centre."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def bake(loaded: Loaded, settings: Baking) -> Octree:
     layout, depths, coefficients = (
         _as_learnt(model, loaded, settings) if isinstance(model, DrawsOctree) else _baked(loaded, settings)
     )
-    leaves, lost = packed(depths, coefficients)
+    leaves, lost = packed(depths, coefficients, BITS)
     leaves = replace(leaves, table=leaves.table.repeat(len(layout.levels)))
     say(f"rounded to bytes: opacities of cells by {lost.opacity:.2g}, colours by {lost.color:.2g} (root mean square)")
     scene = model.scene
@@ -110,26 +112,35 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
     pixels = int(CELLS_PER_PIXEL * model.scene.image_size)
     most = MAX_UNBOUNDED_RESOLUTION if model.scene.unbounded else MAX_RESOLUTION
     resolution = settings.resolution or min(max(pixels, MIN_RESOLUTION), most)
-    layout, raw, seen = _visible(model, dataset, resolution)
+    search = MatterSearch(model)
+    layout, raw, seen = _visible(model, search, dataset, resolution)
     while settings.resolution is None and resolution > MIN_RESOLUTION:
         if not is_too_fine(seen.largest, settings.max_bytes, degrees):
             break
         resolution //= 2
         say(f"half of these would not fit; {resolution} cells along the longest edge instead")
-        layout, raw, seen = _visible(model, dataset, resolution)
+        layout, raw, seen = _visible(model, search, dataset, resolution)
+    depths, places = depths_of(raw[:, 0]), layout.centers()
+    if AVERAGED:
+        shown, rows = layout.part(seen.largest.nonzero()[:, 0])
+        del seen  # it takes as much memory as the new one
+        depths[rows], places[rows] = search.averaged(shown, depths[rows])
+        raw = raw_of(depths)[:, None]
+        # A surface that is less deep shows some of what its centres hide.
+        seen = seen_leaves(layout, raw, dataset.cameras, model.scene.near, model.scene.far)
     degree, kept = chosen(seen.largest, settings.max_bytes, degrees)
     visible = len(visible_leaves(seen.largest))
     if len(kept) < visible:
         say(f"the size leaves room for {len(kept):,} of {visible:,} leaves: those with the largest weights")
     layout, rows = layout.part(kept)
-    raw, seen = raw[rows], seen.part(rows)
+    raw, depths, places, seen = raw[rows], depths[rows], places[rows], seen.part(rows)
     say(f"{layout.num_leaves:,} leaves with harmonics of degree {degree}, cells of {layout.cell:.3g} scene units")
     firsts, fitted = layout.firsts_of_levels, list[Tensor]()
     for level, first, end in zip(layout.levels, firsts, firsts[1:], strict=False):
         if first < end:
-            centers, part = level.within([]).centers(), seen.part(torch.arange(first, end))
-            fitted.append(fitted_colors(field_colors(model, centers, level.cell), centers, part, degree))
-    coefficients, depths = torch.cat(fitted), depths_of(raw[:, 0])
+            own, part = places[first:end], seen.part(torch.arange(first, end))
+            fitted.append(fitted_colors(field_colors(model, own, level.cell), own, part, degree))
+    coefficients = torch.cat(fitted)
     if settings.seconds > 0:
         depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
     return layout, depths, coefficients
@@ -154,9 +165,10 @@ def _bakeable(loaded: Loaded) -> RayModel[Any]:
     return model
 
 
-def _visible(model: RayModel[Any], dataset: Dataset, resolution: int) -> tuple[OctreeLayout, Tensor, Seen]:
+def _visible(
+    model: RayModel[Any], search: MatterSearch, dataset: Dataset, resolution: int
+) -> tuple[OctreeLayout, Tensor, Seen]:
     """Return cells with matter, their raw densities (L, 1), and how training images see them."""
-    search = MatterSearch(model)
     grids = search.grids(resolution)
     layout, depths = search.layout(grids)
     if not layout.num_leaves:

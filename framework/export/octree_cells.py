@@ -14,6 +14,7 @@ from nerfloom.export.density import LatticeDensity
 from nerfloom.export.lattice import lattice_of
 from nerfloom.geometry.bounds import nested_boxes
 from nerfloom.kernels.octree.layout import BRICK, OCTANT, OctreeLayout
+from nerfloom.octrees.coarser import joined_depths
 from nerfloom.octrees.grid import Grid
 from nerfloom.renderable import Renderable
 from nerfloom.samplers.base import SkipsCells
@@ -129,6 +130,30 @@ class MatterSearch:
             found.append((cells[kept].to(torch.int16), depths[kept]))
         cells, depths = (torch.cat(parts) for parts in zip(*found, strict=True))
         return cells.long(), depths
+
+    def averaged(self, layout: OctreeLayout, depths: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the optical depth (L,) of leaves by the densities of their eighths, and a position (L, 3) of matter.
+
+        A leaf's centre alone aliases: PlenOctrees (Yu et al. 2021, section 3.3) takes the mean of many positions.
+        The depth is that of a larger cell for its eighths (`joined_depths`). The position is the mean of the eighths'
+        centres, weighted by their opacities.
+
+        Args:
+            layout: where the leaves are.
+            depths: (L,) their depths, from their centres. Leaves of a sky keep theirs.
+        """
+        offsets = torch.cartesian_prod(*[torch.tensor([0.25, 0.75])] * 3).flip(1)  # index x + 2 y + 4 z
+        found, places = list[Tensor](), list[Tensor]()
+        for number, level in enumerate(layout.levels):
+            parts = level.cells().split(OCTANTS_AT_ONCE * OCTANT**3 // 8)
+            for cells in track(parts, "Averaging leaves", total=len(parts)):
+                positions = level.origin + level.cell * (cells[:, None] + offsets)
+                sigma = self._densities[number].density(positions.reshape(-1, 3)).view(-1, 8)
+                eighths = sigma * (level.cell / 2)
+                weights = -torch.expm1(-eighths) + 1e-6
+                found.append(joined_depths(eighths))
+                places.append((weights[..., None] * positions).sum(1) / weights.sum(1, keepdim=True))
+        return torch.where(depths == OPAQUE, depths, torch.cat(found).clamp(min=MIN_DEPTH)), torch.cat(places)
 
     def layout(self, grids: Sequence[Grid]) -> tuple[OctreeLayout, Tensor]:
         """Return the layout of the cells with matter in some grids, and the optical depth (L,) of their edges.

@@ -15,9 +15,11 @@ from nerfloom.octrees.coarser import halved
 from nerfloom.octrees.octree import Octree
 from nerfloom.octrees.packing import packed
 
-MIN_WEIGHT = 0.02
+MIN_WEIGHT = 0.01
 """Leaves with a smaller largest weight on training rays are left out."""
-COMPRESSED = 0.85
+BITS = 6
+"""Number of bits of a value in a baked file. Compression removes the others of a byte."""
+COMPRESSED = 0.85 - (8 - BITS) / 8
 """Expected size of a file, relative to its leaves' bytes."""
 DEGREES = (2, 1, 0)
 """Degrees of harmonics to choose from, best first."""
@@ -118,7 +120,7 @@ def _reduced(octree: Octree, seen: Seen, degree: int, kept: Tensor) -> Octree:
     if degree == octree.degree:
         return part
     coefficients = fitted_colors(leaf_colors(part.leaves), part.layout.centers(), seen.part(kept), degree)
-    return replace(part, leaves=packed(part.leaves.depths(), coefficients)[0])
+    return replace(part, leaves=packed(part.leaves.depths(), coefficients, BITS)[0])
 
 
 def _changes(given: Octree, coarser: Octree, found: Octree) -> str:

@@ -131,6 +131,10 @@ class NetworkGrid(Field):
         widths = *self.trunk.widths, *self.color_head.widths
         self.runs_on_kernels = depth < MAX_LAYERS and max(widths) <= MAX_WIDTH
 
+    def move_to(self, box: Tensor) -> None:
+        """Move the grid of cells to another `box` (2, 3); the number of cells along each axis stays the same."""
+        self.box.copy_(box)
+
     def located(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Return the cell (N,) int64 of each position, and its place (N, 3) in the cell, in [-1, 1].
 

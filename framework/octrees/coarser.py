@@ -58,6 +58,17 @@ def with_levels(octree: Octree) -> Octree:
     return replace(octree, layout=levels[0].within(levels[1:]), leaves=leaves)
 
 
+def joined_depths(eighths: Tensor) -> Tensor:
+    """Return the optical depth (N,) of the edges of cells: along the axis where their eighths hide most.
+
+    Args:
+        eighths: (N, 8) optical depth of the edge of each eighth (x, y, z), at index x + 2 y + 4 z.
+    """
+    rows = [eighths.view(-1, 2, 2, 2).sum(axis).flatten(1) for axis in (1, 2, 3)]
+    along = [math.log(4) - torch.logsumexp(-row, 1) for row in rows]
+    return torch.stack(along).amax(0).clamp(min=0)
+
+
 Level = tuple[OctreeLayout, Tensor, Tensor]
 """A grid of L leaves, the optical depths (L,) of their edges, and values (L, W) that are linear in their colours."""
 
@@ -92,9 +103,7 @@ def _joined(layout: OctreeLayout, depths: Tensor, values: Tensor) -> Level:
     coarse, order = OctreeLayout.build(layout.origin, 2 * layout.cell, (x, y, z), whole)
     eighths = depths.new_zeros(len(keys), 8)
     eighths[owner, (cells % 2 * cells.new_tensor([1, 2, 4])).sum(-1)] = depths
-    rows = [eighths.view(-1, 2, 2, 2).sum(axis).flatten(1) for axis in (1, 2, 3)]
-    along = [math.log(4) - torch.logsumexp(-row, 1) for row in rows]
-    deepest = torch.stack(along).amax(0).clamp(min=0)
+    deepest = joined_depths(eighths)
     opacities = -torch.expm1(-depths)
     weights = depths.new_zeros(len(keys)).index_add_(0, owner, opacities).clamp(min=1e-9)
     sums = values.new_zeros(len(keys), values.shape[1]).index_add_(0, owner, opacities[:, None] * values)

@@ -356,6 +356,31 @@ def test_extremes(trace) -> None:
     assert raw.grad.isfinite().all()
 
 
+@needs_kernels
+def test_compiled_at_extremes_is_the_reference() -> None:
+    """Values and gradients of opaque, empty and thin leaves of colours of any size, and of a scene without leaves."""
+    torch.manual_seed(11)
+    layout = layout_of(scattered(0.3))
+    raw, coefficients = values(layout, 1)
+    raw[::4], raw[1::4], raw[2::4] = 1e4, -1e4, 80.0
+    coefficients[::3] *= 1e4
+    rays, background = rays_at(layout, 1000), torch.rand(1000, 3)
+    rays, background = (each[rays.directions.abs().amin(-1) > 1e-6] for each in (rays, background))
+    nothing = layout_of(torch.zeros(0, 3, dtype=torch.int64))
+    for there, given in ((layout, (raw, coefficients)), (nothing, (raw[:0], coefficients[:0]))):
+        found = []
+        for trace, kind in ((trace_octree, torch.float32), (trace_octree_reference, torch.float64)):
+            leaves = [part.to(kind, copy=True).requires_grad_() for part in given]
+            cast = rays if kind == torch.float32 else in_float64(rays)
+            light = trace(there, *leaves, cast, background.to(kind))
+            (light.color.sum() + light.opacity.sum()).backward()
+            grads = [torch.zeros_like(part) if part.grad is None else part.grad for part in leaves]
+            found.append((light.color, light.opacity, *grads))
+        for ours, truth in zip(*found, strict=True):
+            assert ours.shape == truth.shape
+            assert not ours.numel() or relative_error(ours, truth) < 1e-3
+
+
 @pytest.mark.parametrize("trace", [trace_octree, trace_octree_reference])
 def test_rays_from_where_float32_does_not_tell_cells_apart(trace) -> None:
     """Such a ray could walk in circles; it meets nothing."""

@@ -1,6 +1,7 @@
 """Files of octrees: written files are read, bytes lose no more than allowed, and hostile files are refused."""
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,13 @@ import pytest
 import torch
 
 from nerfloom.base.errors import DataError
+from nerfloom.geometry.rays import Rays
+from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_reference
 from nerfloom.kernels.octree.light import depths_of, raw_of
+from nerfloom.kernels.octree.packed import trace_packed
+from nerfloom.kernels.octree.trace import trace_octree
 from nerfloom.octrees.files import NAMES, read_octree, write_octree
-from nerfloom.octrees.packing import MAX_DEPTH, packed
+from nerfloom.octrees.packing import CLIPPED, MAX_DEPTH, packed
 from tests.octrees.balls import ball, boxes
 
 
@@ -68,6 +73,43 @@ def test_rounding_to_bytes_loses_what_it_says() -> None:
         print(f"{bits} bits: opacity {lost.opacity:.2g}, colour {lost.color:.2g}")
     assert not leaves.depths()[-5:].any()
     assert len(packed(torch.zeros(0), torch.zeros(0, 3))[0].codes) == 0
+
+
+@pytest.mark.parametrize("bits", [8, 6, 4])
+def test_a_picture_loses_half_a_step_of_each_harmonic_at_most(bits: int) -> None:
+    """The weights of a ray sum to 1 at most, so its colour errs by no more than a leaf's."""
+    torch.manual_seed(bits)
+    octree, degree = ball(2), 2
+    count = octree.layout.num_leaves
+    exact = torch.rand(count, 3 * (degree + 1) ** 2) - 0.5
+    leaves = replace(
+        packed(octree.leaves.depths(), exact, bits)[0], codes=octree.leaves.codes, table=octree.leaves.table
+    )
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    rays = Rays(0.1 * torch.randn(500, 3) - 3 * directions, directions)
+    found = trace_packed(octree.layout, leaves, rays, torch.ones(3)).color
+    raw = raw_of(octree.leaves.depths())[:, None]
+    truth = trace_octree(octree.layout, raw, exact, rays, torch.ones(3)).color
+    basis = spherical_harmonics_reference(directions, degree + 1).abs()
+    # A share of the values at both ends of the range is clipped; values here are uniform, so by about that share.
+    steps = leaves.scales.view(3, -1) * (0.5 + 2 * CLIPPED * 2**bits)
+    bound = basis @ steps.T + 1e-4
+    errors = (found - truth).abs()
+    print(f"{bits} bits: at most {float(errors.max()):.2g} of {float(bound.max()):.2g}")
+    assert bool((errors <= bound).all())
+    assert float(errors.max()) > 0.02 * float(bound.max())
+
+
+def test_fewer_bits_make_a_file_smaller(tmp_path: Path) -> None:
+    octree, sizes = ball(2), []
+    exact = torch.rand(octree.layout.num_leaves, 27)
+    for bits in (8, 6, 4):
+        file = tmp_path / f"{bits}.octree"
+        write_octree(file, replace(octree, leaves=packed(octree.leaves.depths(), exact, bits)[0]))
+        sizes.append(file.stat().st_size)
+    print(sizes)
+    assert sizes[1] < 0.8 * sizes[0]
+    assert sizes[2] < 0.8 * sizes[1]
 
 
 def test_damaged_and_hostile_files(tmp_path: Path) -> None:

@@ -134,7 +134,10 @@ def draw_pixels(dataset: Dataset, count: int) -> Tensor:
 
 
 def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
-    """Draw `count` pixels of `dataset`, equally many from each of `num_images` random images, by torch's generator."""
+    """Draw `count` pixels of `dataset`, equally many from each of `num_images` random images, by torch's generator.
+
+    They are in ascending order: rays of pixels that are close together meet the same part of a model's memory.
+    """
     drawn, ends = dataset.drawn, dataset.cameras.offsets.to(dataset.pixels.device)
     ranks = ends if drawn is None else drawn.ranks(ends)
     sizes = ranks.diff()
@@ -142,7 +145,7 @@ def draw_from_images(dataset: Dataset, count: int, num_images: int) -> Tensor:
     images = some[torch.randint(len(some), (min(num_images, count),), device=some.device)]
     images = images.repeat(-(-count // len(images)))[:count].sort().values
     place = torch.randint(2**62, (count,), device=some.device)  # a range so large that the remainder has no bias
-    chosen = ranks[images] + place % sizes[images]
+    chosen = (ranks[images] + place % sizes[images]).sort().values
     return chosen if drawn is None else drawn.at(chosen)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -65,18 +64,18 @@ class LeafTable(nn.Module):
     Args:
         name: name of the learning rate in logs.
         rate: learning rate.
-        widths: possible numbers of values of a leaf, ascending; the number may grow during training.
+        width: number of values of a leaf.
     """
 
-    def __init__(self, name: str, rate: float, widths: Sequence[int]) -> None:
+    def __init__(self, name: str, rate: float, width: int) -> None:
         super().__init__()
-        self.table, self.widths = nn.Parameter(torch.zeros(0, widths[-1])), widths
+        self.table = nn.Parameter(torch.zeros(0, width))
         self.deferred = RowGradient() if CPP.available() else None
         self.optimised = Optimised(name, rate, sparse=True)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
         saved = state_dict.get(prefix + "table")
-        if saved is not None and saved.ndim == 2 and saved.shape[1] in self.widths:
+        if saved is not None and saved.ndim == 2 and saved.shape[1] == self.table.shape[1]:
             self.table.data = self.table.new_zeros(saved.shape)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
@@ -101,9 +100,8 @@ class OctreeModel(PixelModel[OctreeConfigT], DrawsOctree):
 
     def __init__(self, config: OctreeConfigT, scene: Scene) -> None:
         super().__init__(config, scene)
-        self.densities = LeafTable("densities", config.density_rate * config.learning_rate, [1])
-        widths = [3 * (degree + 1) ** 2 for degree in range(config.degree + 1)]
-        self.colors = LeafTable("colors", config.learning_rate, widths)
+        self.densities = LeafTable("densities", config.density_rate * config.learning_rate, 1)
+        self.colors = LeafTable("colors", config.learning_rate, 3 * (config.degree + 1) ** 2)
         self.register_buffer("frame", torch.cat([scene.box[0].cpu().float(), torch.ones(1)]))
         self.register_buffer("bricks", torch.ones(3, dtype=torch.int64))
         self.register_buffer("cells", torch.zeros(0, 3, dtype=torch.int32))

@@ -15,7 +15,6 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from nerfloom import ConfigError, Dataset, Decision, Loss, Method, PixelBatch, Rays, RowChange, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
@@ -52,9 +51,6 @@ COLOR_VARIATION = 0.1
 RAYS_PER_LOOK = 8
 """One training ray out of this number is followed to its end. It also meets leaves behind others, which are then known
 to be hidden."""
-PLAIN_UNTIL_LAST = True
-"""Whether colours depend on the direction only after the last split. Few values are faster and need fewer rays:
-SVRaster's settings for NeRF-Synthetic begin with degree 0 too."""
 UNUSED = ("depth_loss_mult", "free_space_loss_mult", "thin_gradients", "gradient_scaling")
 """Settings of other methods that cast rays, which have no meaning here."""
 
@@ -169,8 +165,7 @@ class Voxels(OctreeModel[VoxelsConfig]):
         """Set grey fog in a grid with a number of `cells` along the longest edge."""
         layout = self.hull.leaves(cells)
         raw = raw_of(layout.origin.new_full((layout.num_leaves, 1), FOG / cells))
-        degree = 0 if PLAIN_UNTIL_LAST and self.config.num_splits else self.config.degree
-        coefficients = layout.origin.new_zeros(layout.num_leaves, 3, (degree + 1) ** 2)
+        coefficients = layout.origin.new_zeros(layout.num_leaves, 3, (self.config.degree + 1) ** 2)
         coefficients[..., 0] = 0.5 / CONSTANT
         self.set_octree(layout, raw, coefficients.flatten(1))
 
@@ -232,12 +227,7 @@ class Voxels(OctreeModel[VoxelsConfig]):
         if not splits:
             return [RowChange(table, rows) for table in tables]
         # An edge is half as long, so half as deep. Rows are new for Adam: gradients of smaller leaves are smaller.
-        colors = self.coefficients()[rows].unflatten(1, (3, -1))
-        if not any(split for _, split in self._moments[done + 1 :]):
-            terms = (self.config.degree + 1) ** 2
-            colors = functional.pad(colors, (0, terms - colors.shape[2]))
-            self.colors.table.data = colors.new_zeros(0, 3 * terms)
-        values = raw_of(self.depths(rows) / 2)[:, None], colors.flatten(1)
+        values = raw_of(self.depths(rows) / 2)[:, None], self.coefficients()[rows]
         return [RowChange(table, kept[:0], fresh) for table, fresh in zip(tables, values, strict=True)]
 
 

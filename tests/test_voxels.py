@@ -206,26 +206,6 @@ def test_a_split_keeps_the_picture(degree: int) -> None:
     assert all(not state["exp_avg"].any() and len(state["exp_avg"]) == 8 * 512 for state in optimizer.state.values())
 
 
-def test_colours_depend_on_the_direction_after_the_last_split() -> None:
-    model, rays = built(resolution=16, degree=1, num_splits=2).eval(), some_rays()
-    for number, width in ((1, 3), (3, 12)):
-        assert model.colors.table.shape[1] == 3
-        model.colors.table.data = (0.2 + 0.6 * torch.rand_like(model.colors.table)) / CONSTANT
-        model.peaks = torch.ones(model.layout.num_leaves)
-        before = colors(model, rays)
-        optimizer = change(model, number)
-        assert model.colors.table.shape == (model.layout.num_leaves, width)
-        torch.testing.assert_close(colors(model, rays), before, atol=1e-5, rtol=0)
-    saved = {"model": {name: value.clone() for name, value in model.state_dict().items()}}
-    other = built(resolution=16, degree=1, num_splits=2).eval()
-    restore_model(other, saved)
-    assert torch.equal(colors(other, rays), colors(model, rays))
-    count = len(rays)
-    batch = PixelBatch(torch.arange(count), rays, torch.rand(count, 3), torch.rand(count, 3), torch.ones(count))
-    train_step(model, optimizer, batch, 1, 0.9)
-    assert bool(model.colors.table.detach().unflatten(1, (3, 4))[..., 1:].any())
-
-
 def test_dropped_leaves_change_a_ray_by_their_weights_at_most() -> None:
     model, rays = filled(0, prune_weight=0.15), some_rays()
     model.peaks = torch.zeros(512)
@@ -362,7 +342,6 @@ def test_damaged_checkpoints_are_refused() -> None:
         {"cells": state["cells"][:-1]},
         {"cells": state["cells"] + 100},
         {"densities.table": state["densities.table"][:-1]},
-        {"colors.table": state["colors.table"][:, :6]},
         {"peaks": state["peaks"][:-1]},
         {"frame": torch.tensor([0.0, 0.0, math.nan, 1.0])},
         {"frame": torch.zeros(4)},

@@ -552,7 +552,8 @@ def test_the_eikonal_term_counts_samples_and_all_that_silhouettes_leave(monkeypa
     cells = grid.occupancy.cells(asked[0])
     assert not grid.carved[cells].any()
     left = places_of((~grid.carved).nonzero()[:, 0], grid.resolution)[:, 1:] / grid.resolution
-    middle = torch.lerp(*field.box, left.mean(0) + 0.5 / grid.resolution)
+    low, high = field.box
+    middle = torch.lerp(low, high, left.mean(0) + 0.5 / grid.resolution)
     torch.testing.assert_close(asked[0].mean(0), middle, atol=0.1, rtol=0)  # everywhere else
 
 

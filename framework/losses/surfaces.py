@@ -62,20 +62,30 @@ class Eikonal(LossTerm):
         if samples is None or samples.features is None or not len(samples):
             return None
         assert isinstance(field, SurfaceField)
-        elsewhere = field.shape(anywhere(max(len(samples) // ANYWHERE, 1), field, shown.model)).gradients
+        elsewhere = field.shape(random_positions(max(len(samples) // ANYWHERE, 1), field, shown.model)).gradients
         gradients = torch.cat([samples.features[some_of(len(samples)), :3], elsewhere])
         return (gradients.norm(dim=-1) - 1).square().mean()
 
 
-def anywhere(count: int, field: SurfaceField, model: RayModel[Any]) -> Tensor:
-    """Return random positions (count, 3) in the box, in cells that silhouettes do not show to be empty."""
+def random_positions(count: int, field: SurfaceField, model: RayModel[Any]) -> Tensor:
+    """Return random positions in the box, in cells that silhouettes do not show to be empty.
+
+    Args:
+        count: number of positions.
+        field: its box.
+        model: its occupancy grid has the cells.
+
+    Returns:
+        (count, 3).
+    """
     grids = parts(model, OccupancySampler)
     kept = grids[0].kept()[1] if grids else None
     unit = torch.rand(count, 3, device=field.box.device)
     if kept is not None:
         cells = kept[torch.randint(len(kept), (count,), device=kept.device)].long()
         unit = (places(cells, grids[0].resolution)[:, 1:] + unit) / grids[0].resolution
-    return torch.lerp(*field.box, unit)
+    low, high = field.box
+    return torch.lerp(low, high, unit)
 
 
 class Silhouette(LossTerm):

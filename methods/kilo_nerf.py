@@ -31,9 +31,6 @@ SAMPLES = 2**15
 """Samples per training step with an occupancy grid."""
 PAPER_FREQUENCIES = 10
 """Maximum number of frequencies of positions, unless it is given."""
-FITS_MATTER = True
-"""Whether the networks of a scene with a box share the box around the teacher's matter, as in the paper, instead of the
-scene's."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,7 @@ class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
         """
         if self.teacher is not None:
             box = self.scene.box.to(self.device)
-            matter = MatterPoints(self.teacher, box, length_in(box)).around() if FITS_MATTER else None
+            matter = MatterPoints(self.teacher, box, length_in(box)).around()
             if matter is not None and not self.scene.unbounded:
                 self._keep_to(matter)
                 box = matter

@@ -31,6 +31,7 @@ from nerfloom.losses.surfaces import (
     Silhouette,
     SurfacePoints,
     beyond_bounds,
+    mean_of,
     normal_change,
     tangents,
 )
@@ -487,7 +488,7 @@ def test_normals_of_a_ball_change_with_its_curvature() -> None:
     for radius, step in ((0.5, 0.1), (2.0, 0.1)):
         moved = torch.nn.functional.normalize(radius * normals + step * along, dim=-1)
         truth = (2 - 2 / (1 + (step / radius) ** 2) ** 0.5) ** 0.5
-        assert float(normal_change(normals, moved)) == pytest.approx(truth, rel=1e-3)
+        torch.testing.assert_close(normal_change(normals, moved), torch.full((200,), truth), rtol=1e-3, atol=0)
 
 
 def exact_ball() -> tuple[Trainer, SurfaceField]:
@@ -545,7 +546,7 @@ def test_the_eikonal_term_counts_samples_and_all_that_silhouettes_leave(monkeypa
     monkeypatch.setattr(field, "shape", recorded)
     found = Eikonal()(dataclasses.replace(shown, rendered=dataclasses.replace(shown.rendered, samples=longer)))
     at_samples, elsewhere = len(samples) / EVERY, len(samples) // ANYWHERE
-    assert elsewhere > 100
+    assert elsewhere > 50
     assert [len(where) for where in asked] == [elsewhere]
     assert found is not None
     assert found.item() == pytest.approx(at_samples / (at_samples + elsewhere), rel=0.01)
@@ -555,6 +556,16 @@ def test_the_eikonal_term_counts_samples_and_all_that_silhouettes_leave(monkeypa
     low, high = field.box
     middle = torch.lerp(low, high, left.mean(0) + 0.5 / grid.resolution)
     torch.testing.assert_close(asked[0].mean(0), middle, atol=0.1, rtol=0)  # everywhere else
+
+
+def test_slots_without_a_sample_do_not_count() -> None:
+    values = torch.tensor([1.0, 5.0, torch.nan], requires_grad=True)
+    mean = mean_of(values, torch.tensor([True, True, False]))
+    assert mean.item() == 3
+    mean.backward()
+    assert values.grad is not None
+    assert values.grad.tolist() == [0.5, 0.5, 0]
+    assert mean_of(values, torch.zeros(3, dtype=torch.bool)).item() == 0
 
 
 def test_a_single_sample_has_a_curvature() -> None:

@@ -63,8 +63,10 @@ class Eikonal(LossTerm):
             return None
         assert isinstance(field, SurfaceField)
         elsewhere = field.shape(random_positions(max(len(samples) // ANYWHERE, 1), field, shown.model)).gradients
-        gradients = torch.cat([samples.features[some_of(len(samples)), :3], elsewhere])
-        return (gradients.norm(dim=-1) - 1).square().mean()
+        some = some_of(len(samples))
+        gradients = torch.cat([samples.features[some, :3], elsewhere])
+        counted = torch.cat([samples.deltas[some] > 0, torch.ones_like(elsewhere[:, 0], dtype=torch.bool)])
+        return mean_of((gradients.norm(dim=-1) - 1).square(), counted)
 
 
 def random_positions(count: int, field: SurfaceField, model: RayModel[Any]) -> Tensor:
@@ -124,7 +126,17 @@ class Curvature(LossTerm):
         normals = safe_normalize(samples.features[some, :3])
         positions, lengths = samples.positions(shown.batch.rays)[some], samples.deltas[some]
         moved = positions + lengths[:, None] * tangents(normals.detach())
-        return normal_change(normals, safe_normalize(field.shape(moved).gradients))
+        return mean_of(normal_change(normals, safe_normalize(field.shape(moved).gradients)), lengths > 0)
+
+
+def mean_of(values: Tensor, counted: Tensor) -> Tensor:
+    """Return the mean () of the values that count. Slots without a sample, as on a GPU, do not.
+
+    Args:
+        values: (N,).
+        counted: (N,) bool; if all are False, the mean is 0.
+    """
+    return torch.where(counted, values, 0).sum() / counted.sum().clamp(min=1)
 
 
 def some_of(count: int, every: int = EVERY) -> slice:
@@ -146,12 +158,12 @@ def tangents(normals: Tensor) -> Tensor:
 
 
 def normal_change(normals: Tensor, others: Tensor) -> Tensor:
-    """Return the mean difference () of unit normals; for an angle a between them it is 2 sin(a / 2).
+    """Return the difference (N,) of unit normals; for an angle a between them it is 2 sin(a / 2).
 
     Args:
         normals, others: (N, 3).
     """
-    return ((normals - others).square().sum(-1) + SMALLEST_CHANGE**2).sqrt().mean()
+    return ((normals - others).square().sum(-1) + SMALLEST_CHANGE**2).sqrt()
 
 
 class HiddenSpace(LossTerm):

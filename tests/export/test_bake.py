@@ -198,8 +198,7 @@ def test_a_capture_is_baked_without_holes(tmp_path: Path) -> None:
         drawn = DrawnOctree(read_octree(tmp_path / "x.octree"), dataset.scene)
         assert len(octree.layout.levels) == 4
         pictures = [drawn.render_view(dataset.view(index), torch.zeros(3)) for index in range(len(dataset))]
-        # A sky behind the ball's edge is left out if it shows by less than a hundredth.
-        assert min(float(picture.accumulation.min()) for picture in pictures) > 0.98
+        assert min(float(picture.accumulation.min()) for picture in pictures) > 0.99
         found.append(psnr(torch.stack([picture.rgb for picture in pictures]), truth))
     print(f"PSNR {found[0]:.1f} dB, and {found[1]:.1f} dB after learning")
     assert found[0] > 18  # a grey picture has 12 dB

@@ -571,7 +571,7 @@ def test_spz_of_other_programs_is_sorted_by_depth(tmp_path: Path, flags: int) ->
 class Splats:
     """A model that only has Gaussians."""
 
-    scene = SimpleNamespace(warped=False, moving=False)
+    scene = SimpleNamespace(warped=False, moving=False, camera_to_worlds=None)
 
     def __init__(self, gaussians: Gaussians, look: Look = OURS) -> None:
         self.found, self.drawn = gaussians, look

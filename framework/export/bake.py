@@ -18,9 +18,9 @@ from nerfloom.base.console import say
 from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError
 from nerfloom.data.dataset import Dataset
-from nerfloom.export.octree_cells import OPAQUE, MatterSearch
+from nerfloom.export.octree_cells import MatterSearch
 from nerfloom.export.octree_colors import Seen, field_colors, fitted_colors, seen_leaves
-from nerfloom.export.octree_size import BITS, DEGREES, MIN_WEIGHT, chosen, is_too_fine, room_for, visible_leaves
+from nerfloom.export.octree_size import BITS, DEGREES, chosen, is_too_fine, room_for, visible_leaves
 from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.light import depths_of, raw_of
 from nerfloom.method import Method
@@ -125,9 +125,6 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
     raw = raw_of(depths)[:, None]
     # A surface that is less deep shows some of what its centres hide.
     seen = seen_leaves(layout, raw, dataset.cameras, model.scene.near, model.scene.far)
-    # All of the sky that shows stays: behind the edge of matter, a ray would end in nothing without it.
-    is_sky = (depths == OPAQUE) & (seen.largest > 0)
-    seen = replace(seen, largest=torch.where(is_sky, seen.largest.clamp(min=MIN_WEIGHT), seen.largest))
     degree, kept = chosen(seen.largest, settings.max_bytes, degrees)
     visible = len(visible_leaves(seen.largest))
     if len(kept) < visible:

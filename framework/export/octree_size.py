@@ -15,7 +15,7 @@ from nerfloom.octrees.coarser import halved
 from nerfloom.octrees.octree import Octree
 from nerfloom.octrees.packing import packed
 
-MIN_WEIGHT = 0.01
+MIN_WEIGHT = 0.005
 """Leaves with a smaller largest weight on training rays are left out."""
 BITS = 6
 """Number of bits of a value in a baked file. Compression removes the others of a byte."""

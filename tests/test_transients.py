@@ -15,6 +15,7 @@ from nerfloom.registry import load_method
 from nerfloom.scene.transients import in_blocks, transient_share
 from nerfloom.testing.ball import cameras_at, trace
 from nerfloom.training.preparation import decided
+from nerfloom.training.robust_choice import CLEAR
 
 COUNT, SIZE = 14, 48
 """Photographs along an arc, and their width and height, pixels."""
@@ -54,7 +55,7 @@ def with_colors(dataset: Dataset, colors: Tensor) -> Dataset:
 
 
 def covered(dataset: Dataset, side: int, images: range = range(COUNT)) -> Dataset:
-    """The photographs with a square of `side` pixels in some of them, of another colour and at another place in each."""
+    """The photographs with a square of `side` pixels in some of them, each of another colour and at another place."""
     generator = torch.Generator().manual_seed(0)
     pixels = dataset.pixels.clone().view(COUNT, SIZE, SIZE, 3)
     for index in images:
@@ -82,16 +83,16 @@ def found(dataset: Dataset) -> float:
 def test_the_share_of_things_that_stand_in_single_photographs_is_found(side: int, light: bool) -> None:
     dataset = with_colors(STILL, STILL.pixels / 255 * LIGHT) if light else STILL
     share = found(covered(dataset, side))
-    assert 0.6 * (side / SIZE) ** 2 < share < 1.2 * (side / SIZE) ** 2
+    assert (side / SIZE) ** 2 < share < ((side + 4) / SIZE) ** 2  # means over 3 x 3 pixels widen it
 
 
 @pytest.mark.parametrize("factor", [1.0, LIGHT, 1 + NOISE, SHINE], ids=["still", "exposure", "noise", "shine"])
 def test_nothing_is_found_where_nothing_moves(factor: Any) -> None:
-    assert found(with_colors(STILL, STILL.pixels / 255 * factor)) == 0
+    assert found(with_colors(STILL, STILL.pixels / 255 * factor)) < CLEAR / 2
 
 
 def test_a_thing_in_few_photographs_is_missed_and_photographs_far_apart_are_not_judged() -> None:
-    assert found(covered(STILL, 18, range(0, COUNT, 4))) < 0.02
+    assert found(covered(STILL, 18, range(0, COUNT, 4))) < CLEAR
     assert transient_share(courtyard(turn=20.0)) is None
     looking_apart = STILL.cameras.camera_to_worlds.clone()
     looking_apart[:, :, :3] *= torch.tensor([-1.0, 1.0, -1.0])
@@ -114,7 +115,7 @@ def test_a_scout_is_chosen_and_said_only_on_clear_evidence(name: str) -> None:
     assert settings.robust == ("off" if name == "nerf-w" else "scout")
     said = [decision.line() for decision in made if decision.option == "things that come and go"]
     assert len(said) == (name != "nerf-w")
-    assert all("--robust scout" in line and "contradict 6% of a photograph" in line for line in said)
+    assert all("--robust scout" in line and "contradict 9% of a typical photograph" in line for line in said)
     if name == "nerf-w":  # it has a transient part of its own
         return
     assert decided(method, dataclasses.replace(method.config, robust="off"), crowd)[1].robust == "off"

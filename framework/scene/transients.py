@@ -87,7 +87,7 @@ def neighbours(dataset: Dataset, index: int, away: float) -> list[int]:
 
 
 def reduced(dataset: Dataset, index: int) -> Tensor:
-    """Return an image with a longer side of up to `SIDE` pixels, (4, h, w): its colours, and the share of kept pixels."""
+    """Return an image of at most `SIDE` pixels a side, (4, h, w): its colours, and the share of kept pixels."""
     height, width = dataset.cameras.sizes[index]
     stride = max(max(height, width) // (4 * SIDE), 1)
     colors = every(dataset.image(index)[..., :3], stride).float() / 255
@@ -101,7 +101,7 @@ def reduced(dataset: Dataset, index: int) -> Tensor:
 def least_differences(
     dataset: Dataset, index: int, around: list[int], photographs: dict[int, Tensor], near: float
 ) -> Tensor:
-    """Return the difference (h, w) of each pixel of a reduced image from its neighbours, at the distance that fits best.
+    """Return the difference (h, w) of each pixel of a reduced image from its neighbours, at the best distance.
 
     At each distance it is the difference from the neighbour that fits second best. Colours of each neighbour are
     multiplied by a factor for each channel, so that exposure and white balance may differ.

@@ -11,9 +11,10 @@ from nerfloom.scene.transients import transient_share
 
 ConfigT = TypeVar("ConfigT", bound=TrainConfig)
 CLEAR = 0.02
-"""Minimum `transient_share` for a scout. It is at most 0.003 in nine captures and courtyards where nothing moves, and at
-least 0.029 in four with something else pasted over 5 % of each image."""
+"""Minimum `transient_share` for a scout. It is at most 0.003 in seven captures and two courtyards where nothing moves,
+and at least 0.029 in five of these captures with something else pasted over 5 % of each image."""
 OPTION = "things that come and go"
+"""Name of the decision in the profile."""
 
 
 def robust_chosen(config: ConfigT, dataset: Dataset) -> tuple[ConfigT, list[Decision]]:
@@ -42,5 +43,5 @@ def robust_chosen(config: ConfigT, dataset: Dataset) -> tuple[ConfigT, list[Deci
         return config, made if scene.poses == "photographs" else []
     if share < CLEAR:
         return fill(config, off)[0], []
-    reason = f"others contradict {share:.0%} of a photograph, in the median (else: --robust off)"
+    reason = f"others contradict {share:.0%} of a typical photograph (else: --robust off)"
     return fill(config, Choice("robust", "scout", reason, OPTION, "left out by --robust scout"))

@@ -87,7 +87,7 @@ def neighbours(dataset: Dataset, index: int, away: float) -> list[int]:
 
 
 def reduced(dataset: Dataset, index: int) -> Tensor:
-    """Return an image of at most `SIDE` pixels a side, (4, h, w): its colours, and the share of kept pixels."""
+    """Return image `index` with at most `SIDE` pixels a side, (4, h, w): colours, and the share of kept pixels."""
     height, width = dataset.cameras.sizes[index]
     stride = max(max(height, width) // (4 * SIDE), 1)
     colors = every(dataset.image(index)[..., :3], stride).float() / 255

@@ -101,6 +101,7 @@ class Method:
         for rule in (
             depth_choice(scene),
             appearance_choice(config, scene),
+            Choice("robust", "off", ""),  # from images alone, by `training/robust_choice.py`
             Choice("rays_shared_by", SHARED_BY if scene.unbounded else 0, ""),
             Choice("samples_per_batch", None, "steps have a number of rays"),
             sampler_choice(config, scene.unbounded),

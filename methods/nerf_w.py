@@ -56,6 +56,7 @@ class NerfWConfig(
     adam_eps=1e-15,
     eval_num_rays_per_chunk=4_096,
     appearance_embedding_dim=48,
+    robust="off",
 ):
     """Settings of nerf-w; open ones depend on the scene."""
 

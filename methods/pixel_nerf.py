@@ -54,6 +54,7 @@ class PixelNeRFConfig(
     learning_rate=1e-3,
     background="white",
     eval_num_rays_per_chunk=1_024,
+    robust="off",
 ):
     """Settings of pixel-nerf: the paper's structure, with networks that a processor can train."""
 

@@ -199,9 +199,10 @@ HeldOutAppearance = Literal["mean", "half", "nearest"]
 class RobustConfig(TrainConfig):
     """Settings of a method with a colour loss that uses the weights of pixels."""
 
-    robust: Literal["off", "errors", "scout"] = "off"
+    robust: Auto[Literal["off", "errors", "scout"]] = AUTO
     """How to leave out regions that other images contradict, such as people who walk through. errors: by errors in
-    training. scout: by a field that is trained first, in a part of the budget; then they are masked out."""
+    training. scout: by a field that is trained first, in a part of the budget; then they are masked out. auto: scout if
+    images around it clearly contradict a part of most images, else off."""
 
 
 @dataclass(frozen=True)

@@ -263,10 +263,8 @@ def make_source(kind: str, dataset: Dataset, config: TrainConfig) -> BatchSource
 
 def _contradicted(kind: str, dataset: Dataset, config: TrainConfig) -> LeftOutTiles | None:
     """Return the tiles of `--robust`; None if it is off."""
-    if config.robust == "off":
-        return None
     if config.robust == "scout":
         return LeftOutTiles(dataset, SCOUTED_ALONG)
-    if kind == "views":
-        return ContradictedViews(dataset)
-    return ContradictedTiles(dataset)
+    if config.robust == "errors":
+        return ContradictedViews(dataset) if kind == "views" else ContradictedTiles(dataset)
+    return None

@@ -34,6 +34,7 @@ from nerfloom.scene.seen_cells import seen_cells
 from nerfloom.scene.silhouettes import Silhouettes, pixels_near, visual_hull
 from nerfloom.scene.speed import MIN_IMAGES, MIN_TIMES, motion_bound
 from nerfloom.training.ray_starts import nearest_shown, starts_checked
+from nerfloom.training.robust_choice import robust_chosen
 from nerfloom.training.speed import with_speed
 
 
@@ -55,6 +56,8 @@ def decided(method: Method, config: Any, dataset: Dataset) -> tuple[Dataset, Tra
     _check_cameras(method.name, method.model.cameras, dataset)
     _check_scout(method, config, dataset.scene)
     config, measured = with_speed(config)
+    config, left_out = robust_chosen(config, dataset)
+    measured = measured + left_out
     settings, made = method.decided(config, dataset.scene)
     made = measured + made
     settings, made = starts_checked(config, settings, made, dataset)

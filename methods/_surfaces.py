@@ -127,8 +127,9 @@ class SurfaceConfig(
     color_loss: Auto[Literal["squared", "absolute"]] = AUTO
     """Error of colours. absolute: as in NeuS and VolSDF; edges and highlights that are still wrong count less, so that
     surfaces form where there is little texture. auto: absolute if there is a background, otherwise squared."""
-    eikonal_loss_mult: float = 0.003
-    """Weight of the term that keeps the distance's gradient at length 1."""
+    eikonal_loss_mult: Auto[float] = AUTO
+    """Weight of the term that keeps the distance's gradient at length 1. auto: 0.01 if there is a background, otherwise
+    0.003."""
     silhouette_loss_mult: float = 0.01
     """Weight of the difference between opacity and the images' alpha."""
     points_loss_mult: float = 0.1
@@ -153,9 +154,9 @@ class SurfaceConfig(
     """Length of a training step in widths of the surface, limited to one to four steps of --num-steps. 0: one step."""
     eval_rendering: Literal["volume", "surface"] = "volume"
     """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
-    sharpen_until: float = 0.3
+    sharpen_until: Auto[float] = AUTO
     """Fraction of the budget until the upper bound of the inverse width has risen, exponentially, to 50 times the first
-    value."""
+    value. auto: 0.8 if there is a background, otherwise 0.3."""
     open_levels_until: float = 0.3
     """Fraction of the budget until all levels of the hash grid are open, from coarse to fine (hash-grid)."""
 
@@ -179,9 +180,10 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
         Choice("hidden_width", 64 if on_grid else 256, suits),
     )
     config, cells = fill(config, finest_cells(scene))
-    error, start, reason = "squared", 0.25, "nothing is behind the surfaces"
+    error, start, sharp, unit, reason = "squared", 0.25, 0.3, 0.003, "nothing is behind the surfaces"
     if config.background_model == "sphere":
-        error, start, reason = "absolute", 0.5, "a background could explain what has no texture"
+        error, start, sharp, unit, reason = "absolute", 0.5, 0.8, 0.01, "a background could explain what has no texture"
+    config, _ = fill(config, Choice("sharpen_until", sharp, reason), Choice("eikonal_loss_mult", unit, reason))
     color = Choice("color_loss", error, reason, "error of colours")
     radius = Choice("start_radius", start, reason, "radius of the first ball")
     config, own = fill(config, color, radius, refinement_choice(scene, marched=False))

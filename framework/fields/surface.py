@@ -126,8 +126,8 @@ class SurfaceField(Field):
             directions = DIRECTION_LEVELS**2 if direction_frequencies is None else 3 + 6 * direction_frequencies
             inputs = PLACED + distance.num_features + directions + (0 if appearance is None else appearance.size)
             self.color_head = MLP(inputs, *[width] * color_layers, 3, bias=color_bias, activation="sigmoid")
-        self.resolution = 1
-        """Cells along each axis of the box, of the sampler's grid."""
+        self.cell = 0.0
+        """Diagonal of the sampler's cells, scene units: the maximum distance between two positions in a cell."""
         self.progress = 0.0
         """Fraction of the training budget that is spent."""
 
@@ -194,18 +194,15 @@ class SurfaceField(Field):
         return self.density_at(shape.distances), torch.cat([shape.gradients, placed, shape.features], dim=-1)
 
     def density_around(self, points: Points) -> tuple[Tensor, Tensor]:
-        """Return a bound of the density (N,) in the cell of each point, and no features, (N, 0).
+        """Return a bound of the density (N,) within `cell` of each point, and no features, (N, 0).
 
-        No position in a cell is farther from its middle than half of its diagonal. The inside counts as occupied: a
-        surface that retreats during training must find its cells.
+        The inside counts as occupied: a surface that retreats during training must find its cells.
 
         Args:
             points: N points.
         """
-        low, edges = self.box[0], (self.box[1] - self.box[0]) / self.resolution
-        middles = low + edges * (((points.positions - low) / edges).floor() + 0.5)
-        distances = self.distance.values(middles)
-        return self.density_at(distances - edges.norm() / 2), distances.new_zeros(len(points), 0)
+        distances = self.distance.values(points.positions)
+        return self.density_at(distances - self.cell), distances.new_zeros(len(points), 0)
 
 
 class NeuSField(SurfaceField):

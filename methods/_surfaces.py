@@ -102,6 +102,7 @@ class SurfaceConfig(
         "bounds_loss_mult": AT_LEAST_0,
         "hidden_loss_mult": AT_LEAST_0,
         "curvature_loss_mult": AT_LEAST_0,
+        "curvature_from": (0, 1),
         "curvature_until": (0, 1),
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
@@ -141,8 +142,12 @@ class SurfaceConfig(
     Only with a background on a sphere, and with an occupancy grid."""
     curvature_loss_mult: float = 0.002
     """Weight of the change of normals along the surface."""
-    curvature_until: float = 0.4
-    """Fraction of the budget during which --curvature-loss-mult applies: details of a surface come last."""
+    curvature_from: Auto[float] = AUTO
+    """Fraction of the budget until --curvature-loss-mult applies. auto: 0.5 if there is a background, where the first
+    shape has to retreat before, otherwise 0."""
+    curvature_until: Auto[float] = AUTO
+    """Fraction of the budget after which --curvature-loss-mult does not apply any more: details come last. auto: 1 if
+    there is a background, otherwise 0.4."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""
@@ -180,10 +185,16 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
         Choice("hidden_width", 64 if on_grid else 256, suits),
     )
     config, cells = fill(config, finest_cells(scene))
-    error, start, sharp, unit, reason = "squared", 0.25, 0.3, 0.003, "nothing is behind the surfaces"
-    if config.background_model == "sphere":
-        error, start, sharp, unit, reason = "absolute", 0.5, 0.8, 0.01, "a background could explain what has no texture"
-    config, _ = fill(config, Choice("sharpen_until", sharp, reason), Choice("eikonal_loss_mult", unit, reason))
+    captured = config.background_model == "sphere"
+    reason = "a background could explain what has no texture" if captured else "nothing is behind the surfaces"
+    config, _ = fill(
+        config,
+        Choice("sharpen_until", 0.8 if captured else 0.3, reason),
+        Choice("eikonal_loss_mult", 0.01 if captured else 0.003, reason),
+        Choice("curvature_from", 0.5 if captured else 0.0, reason),
+        Choice("curvature_until", 1.0 if captured else 0.4, reason),
+    )
+    error, start = ("absolute", 0.5) if captured else ("squared", 0.25)
     color = Choice("color_loss", error, reason, "error of colours")
     radius = Choice("start_radius", start, reason, "radius of the first ball")
     config, own = fill(config, color, radius, refinement_choice(scene, marched=False))

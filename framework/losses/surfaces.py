@@ -110,7 +110,7 @@ class Curvature(LossTerm):
 
     Some samples are compared with a position one sample's length away, in a random direction along the level set. The
     term is the mean difference of the two unit normals, so that edges count less than noise everywhere. It applies
-    during the first fraction `curvature_until` of the training budget.
+    from the fraction `curvature_from` of the training budget to the fraction `curvature_until`.
     """
 
     def __init__(self) -> None:
@@ -119,8 +119,9 @@ class Curvature(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
         assert isinstance(field, SurfaceField)
-        late = field.progress > shown.model.config.curvature_until
-        if late or samples is None or samples.features is None or not len(samples):
+        config = shown.model.config
+        applies = config.curvature_from <= field.progress <= config.curvature_until
+        if not applies or samples is None or samples.features is None or not len(samples):
             return None
         some = some_of(len(samples), BENT)
         normals = safe_normalize(samples.features[some, :3])

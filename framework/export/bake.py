@@ -123,7 +123,7 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
     del seen  # it takes as much memory as the new one
     depths[rows], places[rows] = search.averaged(shown, depths[rows])
     raw = raw_of(depths)[:, None]
-    # A surface that is less deep shows some of what its centres hide.
+    # The new depths are often smaller, so leaves behind a surface show that its centres hid.
     seen = seen_leaves(layout, raw, dataset.cameras, model.scene.near, model.scene.far)
     degree, kept = chosen(seen.largest, settings.max_bytes, degrees)
     visible = len(visible_leaves(seen.largest))

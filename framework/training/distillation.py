@@ -162,7 +162,7 @@ class SeenPoints:
         return self.origins[rays] + t[:, None] * self.directions[rays], self.directions[rays]
 
     def toward(self, positions: Tensor) -> Tensor:
-        """Return unit directions (N, 3) in which a random camera sees each of some `positions` (N, 3)."""
+        """Return unit directions (N, 3) from random cameras to `positions` (N, 3)."""
         rays = torch.randint(len(self.origins), (len(positions),), device=positions.device)
         return safe_normalize(positions - self.origins[rays])
 

@@ -257,6 +257,33 @@ def test_names_are_imported_from_the_file_that_defines_them() -> None:
     assert elsewhere == []
 
 
+def test_compiled_functions_get_addresses_of_tensors_that_live() -> None:
+    """An address of a tensor that only its own expression holds is freed memory when the compiled function reads it."""
+
+    def makes(node: ast.AST) -> bool:
+        return any(isinstance(inner, ast.Call) for inner in ast.walk(node))
+
+    dangling, found = [], 0
+    for file in FILES:
+        for call in ast.walk(tree(file)):
+            if not isinstance(call, ast.Call):
+                continue
+            if isinstance(call.func, ast.Attribute):
+                name, owner = call.func.attr, call.func.value
+            else:
+                name, owner = getattr(call.func, "id", ""), call.func
+            tensor = owner if name in ("data_ptr", "arguments", "addresses") else None
+            if name in ("pointer", "ray_arguments", "distance_arguments", "network_arguments"):
+                tensor = call.args[0] if call.args else None
+            if tensor is None:
+                continue
+            found += 1
+            if makes(tensor):
+                dangling.append(f"{named(file)}:{call.lineno}: {ast.unparse(call)}")
+    assert not dangling
+    assert found > 300
+
+
 def test_no_import_circles() -> None:
     """Imports anywhere in a file count: an import in a function is late, and hides a circle."""
     names = {module_of(file): file for file in FILES if file.name != "__init__.py"}

@@ -48,9 +48,10 @@ RAISE_WEIGHTS: Operation[..., Tensor] = Operation("raise_weights", raise_weights
 @RAISE_WEIGHTS.implementation(CPP, order=0)
 def _raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tensor, stop: float = 0.0) -> Tensor:
     count, opacity = layout.num_leaves, rays.fars.new_empty(len(rays))
+    rays = contiguous(rays)  # kept until the call returns: its addresses are passed
     _weights(
         *layout.arguments(), native.pointer(raw, "raw densities", (count, 1)), count,
-        *ray_arguments(contiguous(rays)), stop, native.pointer(weights, "weights", (count,)), opacity.data_ptr(),
+        *ray_arguments(rays), stop, native.pointer(weights, "weights", (count,)), opacity.data_ptr(),
         native.threads(),
     )  # fmt: skip
     return opacity

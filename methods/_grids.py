@@ -11,6 +11,9 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.data.scene import Scene
 from nerfloom.encodings.hash_grid import HashGridConfig
 
+SMALL_TABLE, LARGE_TABLE, SMALL_UP_TO = 17, 19, 512
+"""Base-2 logarithms of the entries of a level, and the largest number of finest cells along an axis for the first."""
+
 
 @dataclass(frozen=True)
 class GridsConfig(HashGridConfig):
@@ -43,3 +46,13 @@ def finest_cells(scene: Scene, per_pixel: int = 1) -> Choice:
     cells = 2 ** (per_pixel * scene.image_size - 1).bit_length()
     reason = f"each of the images' {scene.image_size} pixels gets {per_pixel} or more"
     return Choice("max_resolution", cells, reason, "finest cells along an axis")
+
+
+def table_of_surface(cells: int) -> Choice:
+    """Return the size of tables for a surface that meets about the square of the number of finest cells along an axis.
+
+    Args:
+        cells: that number.
+    """
+    size = SMALL_TABLE if cells <= SMALL_UP_TO else LARGE_TABLE
+    return Choice("log2_table_size", size, f"a surface meets about {cells}^2 of the finest cells")

@@ -39,7 +39,7 @@ from nerfloom.losses.surfaces import (
 )
 from nerfloom.losses.terms import KNOWN_DISTANCES, SamplerLoss
 from nerfloom.methods._captures import RefinedConfig, RefinedModel, refinement_choice
-from nerfloom.methods._grids import finest_cells
+from nerfloom.methods._grids import finest_cells, table_of_surface
 from nerfloom.renderable import parts
 from nerfloom.rendering.background import background_renderer
 from nerfloom.rendering.outputs import NORMALS
@@ -83,7 +83,6 @@ class SurfaceConfig(
     lr_final=0.02,
     adam_beta2=0.99,
     adam_eps=1e-15,
-    log2_table_size=17,
     eval_num_rays_per_chunk=8_192,
     thin_gradients=0.5,
     sphere_around="object",
@@ -119,6 +118,9 @@ class SurfaceConfig(
     """Initial learning rate of Adam. auto: 0.01 on a hash grid, 0.0005 for the papers' networks."""
     max_resolution: Auto[int] = AUTO
     """Cells along an axis of the hash grid's finest level. auto: the next power of two that gives each pixel a cell."""
+    log2_table_size: Auto[int] = AUTO
+    """Base-2 logarithm of the maximum number of entries of a level. auto: 17 up to 512 finest cells along an axis,
+    otherwise 19."""
     hidden_width: Auto[int] = AUTO
     """Features per hidden layer of the two networks. auto: 64 on a hash grid, 256 for the papers' networks."""
     position_frequencies: int = 6
@@ -185,6 +187,7 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
         Choice("hidden_width", 64 if on_grid else 256, suits),
     )
     config, cells = fill(config, finest_cells(scene))
+    config, _ = fill(config, table_of_surface(config.max_resolution))
     captured = config.background_model == "sphere"
     reason = "a background could explain what has no texture" if captured else "nothing is behind the surfaces"
     config, _ = fill(

@@ -618,3 +618,12 @@ def test_a_distance_before_a_point_has_bounds() -> None:
     left, deviations = torch.tensor([0.5, 0.5, 0.5, -0.1, -0.1, -0.1]), torch.full((6,), 0.01)
     found = beyond_bounds(torch.tensor([0.4, 0.6, -0.2, -0.05, 0.2, -0.3]), left, deviations)
     torch.testing.assert_close(found, torch.tensor([0.0, 0.09, 0.19, 0.0, 0.19, 0.19]))
+
+
+@pytest.mark.parametrize(("pixels", "cells", "entries"), [(400, 512, 17), (513, 1024, 19), (800, 1024, 19)])
+def test_tables_hold_the_cells_that_a_surface_meets(pixels: int, cells: int, entries: int) -> None:
+    method, scene = load_method("neus"), dataclasses.replace(ball_in_a_box().scene, image_size=pixels)
+    config, _ = method.decided(method.config, scene)
+    assert (config.max_resolution, config.log2_table_size) == (cells, entries)  # type: ignore[attr-defined]
+    asked = dataclasses.replace(method.config, log2_table_size=15)  # type: ignore[call-arg]
+    assert method.decided(asked, scene)[0].log2_table_size == 15  # type: ignore[attr-defined]

@@ -20,7 +20,7 @@ from nerfloom.geometry.regions import Box, Sphere
 from nerfloom.kernels.splats.project import DC
 from nerfloom.processing import kinds
 from nerfloom.processing.settings import ImagesFlags, VideoFlags
-from nerfloom.splats.files import write_gaussians
+from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from tests.cli.helpers import called, train
 
@@ -169,6 +169,9 @@ def test_what_is_replaced_or_rescaled_keeps_its_methods(ball: Path, tmp_path: Pa
     other = dataclasses.replace(opened, method="other")
     other.export("gaussian-splat", tmp_path / "a.ply")
     assert (other.method, (tmp_path / "a.ply").is_file()) == ("other", True)
+    opened.scaled(Scale(2.0, "cm")).export("gaussian-splat", tmp_path / "b.ply")
+    one, two = (read_gaussians(tmp_path / name).gaussians.means for name in ("a.ply", "b.ply"))
+    torch.testing.assert_close(two, 2 * one)
 
 
 def test_photographs_are_processed_as_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,6 @@ import nerfloom
 from nerfloom.base.errors import CheckpointError, ConfigError
 from nerfloom.cameras.scale import Scale
 from nerfloom.cli.process_data import main as process_data
-from nerfloom.geometry.regions import Box, Sphere
 from nerfloom.kernels.splats.project import DC
 from nerfloom.processing import kinds
 from nerfloom.processing.settings import ImagesFlags, VideoFlags
@@ -116,7 +115,7 @@ def test_files_are_exported_as_by_the_command(run: Path, ball: Path, tmp_path: P
 def test_regions_crop_as_the_flags_do(ball: Path, tmp_path: Path) -> None:
     done = called("ns-export", "gaussian-splat", ball, "--output-dir", tmp_path, "--crop-box=-2,-2,0,2,2,2")
     assert done.returncode == 0, done.stderr
-    upper = Box((-2, -2, 0), (2, 2, 2))
+    upper = nerfloom.edit.Box((-2, -2, 0), (2, 2, 2))
     nerfloom.load(ball).export("gaussian-splat", tmp_path / "python.ply", regions=[upper])
     assert (tmp_path / "python.ply").read_bytes() == (tmp_path / "splat.ply").read_bytes()
     with pytest.raises(ConfigError, match="cameras takes no region"):
@@ -136,7 +135,7 @@ def test_a_point_cloud_lies_on_the_ball(ball: Path, shared_tiny: Path, tmp_path:
     assert done.returncode == 0, done.stderr
     found.write(tmp_path / "python.ply")
     assert (tmp_path / "python.ply").read_bytes() == (tmp_path / "point_cloud.ply").read_bytes()
-    near = opened.point_cloud(regions=[Sphere((0, 0, 1), 0.5)], **few)
+    near = opened.point_cloud(regions=[nerfloom.edit.Sphere((0, 0, 1), 0.5)], **few)
     assert 0 < len(near) < len(found)
     assert float((near.positions - torch.tensor([0, 0, 1.0])).norm(dim=-1).max()) <= 0.5
 

@@ -16,11 +16,10 @@ import nerfloom
 from nerfloom.base.errors import CheckpointError, ConfigError
 from nerfloom.cameras.scale import Scale
 from nerfloom.cli.process_data import main as process_data
-from nerfloom.geometry.regions import Box, Sphere
 from nerfloom.kernels.splats.project import DC
 from nerfloom.processing import kinds
 from nerfloom.processing.settings import ImagesFlags, VideoFlags
-from nerfloom.splats.files import write_gaussians
+from nerfloom.splats.files import read_gaussians, write_gaussians
 from nerfloom.splats.gaussians import Gaussians
 from tests.cli.helpers import called, train
 
@@ -116,7 +115,7 @@ def test_files_are_exported_as_by_the_command(run: Path, ball: Path, tmp_path: P
 def test_regions_crop_as_the_flags_do(ball: Path, tmp_path: Path) -> None:
     done = called("ns-export", "gaussian-splat", ball, "--output-dir", tmp_path, "--crop-box=-2,-2,0,2,2,2")
     assert done.returncode == 0, done.stderr
-    upper = Box((-2, -2, 0), (2, 2, 2))
+    upper = nerfloom.edit.Box((-2, -2, 0), (2, 2, 2))
     nerfloom.load(ball).export("gaussian-splat", tmp_path / "python.ply", regions=[upper])
     assert (tmp_path / "python.ply").read_bytes() == (tmp_path / "splat.ply").read_bytes()
     with pytest.raises(ConfigError, match="cameras takes no region"):
@@ -136,7 +135,7 @@ def test_a_point_cloud_lies_on_the_ball(ball: Path, shared_tiny: Path, tmp_path:
     assert done.returncode == 0, done.stderr
     found.write(tmp_path / "python.ply")
     assert (tmp_path / "python.ply").read_bytes() == (tmp_path / "point_cloud.ply").read_bytes()
-    near = opened.point_cloud(regions=[Sphere((0, 0, 1), 0.5)], **few)
+    near = opened.point_cloud(regions=[nerfloom.edit.Sphere((0, 0, 1), 0.5)], **few)
     assert 0 < len(near) < len(found)
     assert float((near.positions - torch.tensor([0, 0, 1.0])).norm(dim=-1).max()) <= 0.5
 
@@ -169,6 +168,9 @@ def test_what_is_replaced_or_rescaled_keeps_its_methods(ball: Path, tmp_path: Pa
     other = dataclasses.replace(opened, method="other")
     other.export("gaussian-splat", tmp_path / "a.ply")
     assert (other.method, (tmp_path / "a.ply").is_file()) == ("other", True)
+    opened.scaled(Scale(2.0, "cm")).export("gaussian-splat", tmp_path / "b.ply")
+    one, two = (read_gaussians(tmp_path / name).gaussians.means for name in ("a.ply", "b.ply"))
+    torch.testing.assert_close(two, 2 * one)
 
 
 def test_photographs_are_processed_as_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

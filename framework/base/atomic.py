@@ -10,8 +10,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 
-def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
+def write_atomically(path: Path, write: Callable[[BinaryIO], object], flush: bool = True) -> None:
     """Call `write(file)` on a temporary binary file beside `path`, flush it to disk and rename it.
+
+    Args:
+        path: the file.
+        write: writes its content.
+        flush: False for files that may be damaged after a loss of power, because they can be made again.
 
     Raises:
         OSError: if the file cannot be written; `path` is then unchanged, and no temporary file is left.
@@ -20,13 +25,15 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     try:
         with temporary.open("wb") as file:
             write(file)
-            file.flush()
-            os.fsync(file.fileno())
+            if flush:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _flush_folder(path.parent)
+    if flush:
+        _flush_folder(path.parent)
 
 
 def _flush_folder(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -121,6 +122,7 @@ def _command(arguments: list[str]) -> None:
     from nerfloom.edit.held_out import HeldOut
     from nerfloom.edit.recipe import write_recipe
     from nerfloom.edit.taking import take_steps
+    from nerfloom.splats.files import READ
     from nerfloom.training.load import load
 
     loaded = load(found, flags.load_checkpoint, flags.device_type, flags.data, data_format=named)
@@ -134,6 +136,9 @@ def _command(arguments: list[str]) -> None:
         say("the file is in another frame than the photographs, so that commands cannot compare it with them")
     size = flags.output_path.stat().st_size / 1e6
     say(f"{size:.2f} MB, {edited.look.words()}: {flags.output_path}")
+    if flags.output_path.suffix.lower() in READ:
+        name = shlex.quote(str(flags.output_path))
+        say(f"next:  ns-viewer {name}  or  ns-export web {name} --output-dir exports")
 
 
 def _check(flags: EditFlags) -> None:

@@ -6,7 +6,8 @@
     edited = edit.drop_floaters(edit.crop_sphere(edited, (0, 0, 0), 2.0))
     edited.write("clean.spz")
 
-Each step takes an `Edited` and returns another one. `ns-edit` takes the same steps, by the same names.
+Each step takes an `Edited` and returns another one. `ns-edit` takes the same steps, by the same names. Exports keep the
+inside of a `Box` or a `Sphere`.
 """
 
 from __future__ import annotations
@@ -36,3 +37,7 @@ from nerfloom.edit.recipe import Step as Step
 from nerfloom.edit.recipe import read_recipe as read_recipe
 from nerfloom.edit.recipe import write_recipe as write_recipe
 from nerfloom.edit.taking import take_steps as take_steps
+from nerfloom.geometry.regions import Box as Box
+from nerfloom.geometry.regions import Sphere as Sphere
+from nerfloom.geometry.regions import read_region as read_region
+from nerfloom.geometry.regions import write_region as write_region

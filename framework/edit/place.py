@@ -15,12 +15,14 @@ from nerfloom.cameras.scale import checked
 from nerfloom.edit.edited import UP, Edited
 from nerfloom.edit.similarity import Similarity, about, axis_rotation, direction, vector
 from nerfloom.geometry.alignment import align
-from nerfloom.geometry.floor import Plane, find_floor
+from nerfloom.geometry.floor import Plane, find_floor, size_of
 from nerfloom.geometry.regions import Vector
 from nerfloom.renderable import training_poses
 
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 """The origin."""
+NEAR_FLOOR = 0.01
+"""Distance from the floor in the report of `align_floor`, scene sizes (`size_of`)."""
 
 
 def move(edited: Edited, by: Vector) -> Edited:
@@ -113,7 +115,8 @@ def align_floor(
         up: the direction that is about upwards, of any length but 0; None for the up direction of the last `set_up` or
             `align_floor`, or else of the scene, which comes from the cameras of photographs.
         max_tilt: maximum angle between it and the floor's normal, degrees.
-        tolerance: maximum distance of the floor's centres from it; None for 1 % of the scene's size.
+        tolerance: maximum distance of the floor's centres from it; None for 1 % of the median distance of all opaque
+            centres from their middle.
         min_opacity: minimum opacity of the Gaussians that count.
         seed: seed of the search; the same one finds the same floor.
 
@@ -131,7 +134,10 @@ def align_floor(
         )
     rotation = rotation_between(floor.normal, UP)
     tilt = math.degrees(2 * math.asin(min(float((floor.normal - UP).norm()) / 2, 1.0)))
-    say(f"align_floor: {floor.share:.0%} of the opaque Gaussians are on the floor, which was tilted by {tilt:.2f}°")
+    near = float(f"{NEAR_FLOOR * size_of(opaque):.1g}")
+    share = float((((opaque - floor.center) @ floor.normal).abs() <= near).double().mean())
+    within = f"within {near:g} {edited.scale.unit or 'units'} of the floor"
+    say(f"align_floor: {share:.0%} of the opaque Gaussians are {within}, which was tilted by {tilt:.2f}°")
     subject = _subject(edited, opaque, floor)
     if subject is None:
         foot, where = floor.center, "in its middle"

@@ -7,7 +7,6 @@ on, so frames of one command are never used for another. render.json holds the h
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import shutil
 import time
@@ -17,7 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from torch import Tensor
@@ -106,14 +105,20 @@ class Frames:
             last.result()
 
     def _keep(self, index: int, arrays: Arrays) -> None:
-        """Write frame `index`, compressed if all frames together would be large."""
+        """Write frame `index`, compressed if all frames together would be large.
+
+        It is not flushed to the disk: `read` refuses a damaged frame, which is then rendered again.
+        """
         plain = self.count * sum(values.nbytes for values in arrays.values()) <= MAX_PLAIN
-        content, method = io.BytesIO(), zipfile.ZIP_STORED if plain else zipfile.ZIP_DEFLATED
-        with zipfile.ZipFile(content, "w", method, compresslevel=LEVEL) as file:  # as numpy's savez, which has no level
-            for name, values in arrays.items():
-                with file.open(f"{name}.npy", "w") as part:
-                    np.lib.format.write_array(part, values, allow_pickle=False)
-        write_file(self.path(index), content.getvalue())
+        method = zipfile.ZIP_STORED if plain else zipfile.ZIP_DEFLATED
+
+        def write(file: BinaryIO) -> None:
+            with zipfile.ZipFile(file, "w", method, compresslevel=LEVEL) as archive:  # numpy's savez has no level
+                for name, values in arrays.items():
+                    with archive.open(f"{name}.npy", "w") as part:
+                        np.lib.format.write_array(part, values, allow_pickle=False)
+
+        _write(self.path(index), write, flush=False)
 
     def remove(self) -> None:
         """Remove the frames, and the folder beside the file unless it has frames of another render."""
@@ -171,7 +176,12 @@ def write_file(path: Path, content: bytes) -> None:
     Raises:
         ConfigError: if it cannot be written.
     """
+    _write(path, lambda file: file.write(content))
+
+
+def _write(path: Path, write: Callable[[BinaryIO], object], flush: bool = True) -> None:
+    """Call `write_atomically`, and convert errors of the system."""
     try:
-        write_atomically(path, lambda file: file.write(content))
+        write_atomically(path, write, flush)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror or error}") from error

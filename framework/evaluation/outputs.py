@@ -157,5 +157,5 @@ def shown_output(kept: Arrays, name: str, ranges: Mapping[str, tuple[float, floa
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Join `pictures` (H, W, 3) from left to right into one picture (H, W', 3)."""
-    return np.concatenate(list(pictures), axis=1)
+    """Join `pictures` (H, W, 3) from left to right into one picture (H, W', 3); a single one is not copied."""
+    return pictures[0] if len(pictures) == 1 else np.concatenate(list(pictures), axis=1)

@@ -85,6 +85,8 @@ def _write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 def _even(picture: np.ndarray) -> np.ndarray:
     """Repeat a picture's last row or column where its size is odd; H.264 needs even sizes."""
     height, width = picture.shape[:2]
+    if height % 2 == width % 2 == 0:
+        return picture  # numpy's pad copies also where it adds nothing
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 

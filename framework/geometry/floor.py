@@ -36,7 +36,14 @@ class Plane(NamedTuple):
     center: Tensor
     """(3,) float64 mean of the points near it."""
     share: float
-    """Share of the points that are near it."""
+    """Share of the points that the last fit counts."""
+
+
+def size_of(points: Tensor) -> float:
+    """Return the diagonal of the box between the 5th and the 95th percentile of points (N, 3) along each axis."""
+    ordered = points.double().sort(0).values
+    last = len(points) - 1
+    return float((ordered[last - round(0.05 * last)] - ordered[round(0.05 * last)]).norm())
 
 
 def find_floor(
@@ -53,7 +60,8 @@ def find_floor(
         points: (N, 3) positions on surfaces.
         up: (3,) float64 unit vector, about upwards.
         max_tilt: maximum angle between `up` and the floor's normal, degrees.
-        tolerance: maximum distance of the floor's points from it; None for 1 % of the points' spread.
+        tolerance: maximum distance of the floor's points from it; None for 1 % of the median distance of all points
+            from their middle. Fits may reduce it.
         seed: seed of the random planes.
         above: (M, 3) positions above the floor, such as the cameras; None for none.
     """

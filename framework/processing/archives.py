@@ -11,7 +11,7 @@ from nerfloom.base.errors import DataError
 from nerfloom.downloads.unpack import Place, names_of, unpack
 
 UNPACKED = "unpacked"
-"""Folder of the files in the output folder."""
+"""Usual name of the folder of the files, in the output folder."""
 
 
 def check_archive(archive: Path, place: Place, needs: str) -> None:
@@ -21,17 +21,18 @@ def check_archive(archive: Path, place: Place, needs: str) -> None:
         DataError: if it has none, is damaged, or has an unsafe path.
     """
     if not any(place(parts) for parts in names_of(archive)):
-        raise DataError(f"--data {archive} has no {needs}")
+        raise DataError(f"{archive} has no {needs}")
 
 
 @contextmanager
-def unpacked(data: Path, output: Path, place: Place) -> Iterator[Path]:
+def unpacked(data: Path, output: Path, place: Place, name: str = UNPACKED) -> Iterator[Path]:
     """Unpack a zip file within a `with` block.
 
     Args:
         data: the zip file, or a folder, which is yielded as it is.
         output: the output folder, claimed by `output.claim`.
         place: as in `unpack`.
+        name: name of a new folder in the output folder.
 
     Yields:
         The folder of the files.
@@ -42,7 +43,7 @@ def unpacked(data: Path, output: Path, place: Place) -> Iterator[Path]:
     if data.is_dir():
         yield data
         return
-    folder = output / UNPACKED
+    folder = output / name
     try:
         unpack(data, folder, place)
         yield folder

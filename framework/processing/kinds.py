@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -157,14 +157,20 @@ def _convert_polycam(flags: PolycamFlags) -> None:
 
 def _convert_record3d(flags: Record3DFlags) -> None:
     from nerfloom.processing import record3d
+    from nerfloom.processing.archives import check_archive, unpacked
     from nerfloom.processing.named_images import images_as_named
     from nerfloom.processing.point_files import with_points
     from nerfloom.processing.posed_folder import write_capture
 
     needs = "rgbd and metadata, which recordings of Record3D (.r3d) have"
-    with _export(flags, record3d.place, record3d.find_root, needs) as export:
-        root = record3d.find_root(export)
-        capture = with_points(record3d.read_capture(root, flags.most), flags.ply)
+    archive = None if flags.ply is None or flags.ply.suffix.lower() != ".zip" else flags.ply
+    if archive is not None:
+        check_archive(archive, record3d.place_points, "PLY file; export 'Zipped sequence of PLY point clouds'")
+    with _export(flags, record3d.place, record3d.find_root, needs) as export, ExitStack() as opened:
+        root, points = record3d.find_root(export), flags.ply
+        if archive is not None:
+            points = opened.enter_context(unpacked(archive, flags.output_dir, record3d.place_points, "unpacked points"))
+        capture = with_points(record3d.read_capture(root, flags.most), points)
         write_capture(root / "rgb", capture, images_as_named(capture), flags.output_dir, flags.num_downscales)
 
 

@@ -71,6 +71,15 @@ def place(parts: tuple[str, ...]) -> tuple[str, ...] | None:
     return None
 
 
+def place_points(parts: tuple[str, ...]) -> tuple[str, ...] | None:
+    """Return the name for a PLY file, at `parts` in a zip file of points; None for other files.
+
+    The points of all frames are in the frame of the poses, as nerfstudio's reader takes them.
+    """
+    name = parts[-1]
+    return (name,) if name.lower().endswith(".ply") and not name.startswith(".") else None
+
+
 def find_root(export: Path) -> Path:
     """Return the folder with rgb and metadata.json: `export` or one in it.
 

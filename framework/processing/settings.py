@@ -193,7 +193,7 @@ class Record3DFlags(RecordingFlags):
     """Convert Record3D's export with EXR and RGBD."""
 
     ply: Path | None = None
-    """Points that Record3D has exported of the same recording: a PLY file, or a folder of several."""
+    """Points that Record3D has exported of the same recording: a PLY file, or a folder or a zip file of several."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -25,6 +25,8 @@ from nerfloom.renderable import Renderable, refined_cameras, with_refined_poses
 from nerfloom.rendering.rendered import Picture
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import Run
+
+LoadedT = TypeVar("LoadedT", bound="Loaded")
 
 
 @dataclass(frozen=True, repr=False)
@@ -207,13 +209,13 @@ class Loaded:
         return self._measured(start, end, self.scale, time)
 
     def with_scale(
-        self,
+        self: LoadedT,
         start: Tensor | Sequence[float],
         end: Tensor | Sequence[float],
         distance: float,
         unit: str = "m",
         time: float | None = None,
-    ) -> Loaded:
+    ) -> LoadedT:
         """Return this in a scale that gives two points a known distance; `keep_scale` writes the scale to the run.
 
         Args:
@@ -228,7 +230,7 @@ class Loaded:
         found = self._measured(start, end, replace(self.scale, relative_error=0.0), time)
         return self.scaled(scale_of(found, self.scale, distance, unit))
 
-    def scaled(self, scale: Scale) -> Loaded:
+    def scaled(self: LoadedT, scale: Scale) -> LoadedT:
         """Return this in another `scale`."""
         return replace(self, placement=scale.placed(self.input_placement), scale=scale)
 

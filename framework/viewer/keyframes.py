@@ -13,6 +13,7 @@ from torch import Tensor
 from nerfloom.cameras.camera_path import CameraPath, Keyframe
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.alignment import nearest_rotations
+from nerfloom.video.settings import FramesSettings
 
 MAX_KEYFRAMES = 500
 """Maximum number of cameras on a path."""
@@ -30,8 +31,8 @@ class Editor:
     """Cameras in path order."""
     seconds: float = 2.0
     """Seconds from one camera to the next."""
-    fps: float = 24.0
-    """Frames per second."""
+    fps: float = FramesSettings.fps
+    """Frames per second; by default as in videos of `ns-render`."""
     closed: bool = False
     """Whether the path returns to the first camera."""
 

@@ -60,7 +60,7 @@ class PathPanel:
         self._chosen = gui.add_dropdown("Camera", [NOTHING])
         gui.add_button_group("Chosen", ["go to", "move here", "remove"]).on_click(self._change)
         self._seconds = gui.add_slider("Seconds between", 0.1, 20.0, 0.1, 2.0)
-        self._fps = gui.add_number("Frames per second", 24, min=1, max=120, step=1)
+        self._fps = gui.add_number("Frames per second", round(Editor.fps), min=1, max=120, step=1)
         self._closed = gui.add_checkbox("Closed", False, hint="The path returns to its first camera.")
         for handle in (self._seconds, self._fps, self._closed):
             handle.on_update(lambda _: self._edit(lambda editor: editor))
@@ -113,7 +113,7 @@ class PathPanel:
         self._editor = replace(
             change(self._editor),
             seconds=number_in(self._seconds.value, 0.1, 20.0, 2.0),
-            fps=number_in(self._fps.value, 1, 120, 24),
+            fps=number_in(self._fps.value, 1, 120, Editor.fps),
             closed=self._closed.value is True,
         )
         count = len(self._editor.keyframes)

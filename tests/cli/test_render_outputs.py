@@ -250,11 +250,11 @@ def test_a_full_disk_is_a_line_and_keeps_the_frames(
 ) -> None:
     write, written = frames.write_atomically, []
 
-    def full(path: Path, content: Any) -> None:
+    def full(path: Path, content: Any, flush: bool) -> None:
         written.append(path)
         if len(written) > 3:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        write(path, content)
+        write(path, content, flush)
 
     monkeypatch.setattr(frames, "write_atomically", full)
     said = refused(render_command.main, "orbit", ball_run, "--output-path", tmp_path / "a.gif", "--num-frames", 4)

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import shlex
 import struct
 from pathlib import Path
 
@@ -61,6 +62,17 @@ def test_flags_are_saved_as_a_recipe_that_repeats(file: Path, tmp_path: Path) ->
     found = read_gaussians(first).gaussians
     assert len(found) == 150
     assert found.degree == 1
+
+
+def test_the_next_command_makes_a_page_of_the_file(file: Path, tmp_path: Path) -> None:
+    """Of a glTF file, which is not read again, nothing is said."""
+    output = tmp_path / "a file.spz"
+    words = shlex.split(edited(file, "--output-path", output, "--degree", 0).rpartition(" or ")[2])
+    assert words == ["ns-export", "web", str(output), "--output-dir", "exports"]
+    done = called(*words[:-1], tmp_path / "page")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "page" / "scene.html").is_file()
+    assert "next:" not in edited(file, "--output-path", tmp_path / "a.glb", "--degree", 0)
 
 
 @pytest.mark.parametrize("version", [2, 3])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -196,6 +197,22 @@ def test_the_origin_is_under_what_the_cameras_look_at(
     foot = rotation @ point + shift if is_seen else placed[:1500].mean(0)
     torch.testing.assert_close(foot[:2], torch.zeros(2).double(), atol=1e-4, rtol=0)
     assert float(foot[2]) == pytest.approx(subject[2] if is_seen else 0, abs=1e-4)
+
+
+def test_the_share_on_the_floor_is_counted_at_the_distance_that_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    """A floor that is thicker than what the fit counts."""
+    edited, heights = room(12.0)
+    up = torch.from_numpy(Rotation.from_euler("xyz", [12.0, 4.8, 50.0], degrees=True).as_matrix()[:, 2])
+    off = torch.zeros_like(heights)
+    off[:1500] = torch.linspace(-0.06, 0.06, 1500, dtype=torch.float64)[torch.randperm(1500)]
+    moved = edited.gaussians.means + off[:, None] * up
+    thick = dataclasses.replace(edited, gaussians=dataclasses.replace(edited.gaussians, means=moved))
+    edit.align_floor(dataclasses.replace(thick, scale=Scale(1.0, "cm")))
+    said = re.search(r"(\d+)% of the opaque Gaussians are within (\S+) cm of the floor", capsys.readouterr().err)
+    assert said is not None
+    opaque = (heights + off)[:-3000].abs()
+    assert 0.06 < float(said[2]) < 0.1  # a hundredth of the room's diagonal, which is 8 between the percentiles
+    assert int(said[1]) == pytest.approx(100 * float((opaque <= float(said[2])).double().mean()), abs=1)
 
 
 def test_a_floor_of_another_up_direction() -> None:

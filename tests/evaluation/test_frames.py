@@ -1,5 +1,6 @@
 """Frames on disk: a stopped render goes on, and no frame of another is taken."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -30,18 +31,24 @@ class Renderer:
 def test_a_stopped_render_goes_on(
     limit: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Frames as they are, and compressed ones."""
+    """Frames as they are, and compressed ones. They are not flushed, so a loss of power leaves damaged ones."""
     monkeypatch.setattr(kept_frames, "MAX_PLAIN", limit)
     facts = {"run": "a", "num_frames": 5}
-    first, second = Renderer(stop=3), Renderer()
+    first, second = Renderer(stop=4), Renderer()
+    opened, flushed = open_frames(tmp_path / "a.gif", 5, facts), list[int]()
+    monkeypatch.setattr(os, "fsync", flushed.append)
     with pytest.raises(KeyboardInterrupt):
-        open_frames(tmp_path / "a.gif", 5, facts).render(first)
-    assert "3 of 5 frames are in" in capsys.readouterr().err
+        opened.render(first)
+    assert not flushed
+    assert "4 of 5 frames are in" in capsys.readouterr().err
     frames = open_frames(tmp_path / "a.gif", 5, dict(reversed(facts.items())))
-    frames.path(1).write_bytes(frames.path(1).read_bytes()[:100])  # damaged
+    whole = [frames.path(index).read_bytes() for index in range(3)]
+    frames.path(0).write_bytes(bytes(len(whole[0])))
+    frames.path(1).write_bytes(whole[1][:100])
+    frames.path(2).write_bytes(whole[2].replace(np.float32(2 / 3).tobytes(), bytes(4)) if limit else b"")
     frames.render(second)
-    assert "2 of 5 frames already exist" in capsys.readouterr().err
-    assert (first.rendered, second.rendered) == ([0, 1, 2], [1, 3, 4])
+    assert "1 of 5 frames already exist" in capsys.readouterr().err
+    assert (first.rendered, second.rendered) == ([0, 1, 2, 3], [0, 1, 2, 4])
     for index, kept in enumerate(frames):
         assert kept["rgb"].tolist() == [[[index] * 3] * 2] * 2
         assert kept["depth"].dtype == np.float32

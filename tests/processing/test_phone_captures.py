@@ -5,6 +5,7 @@ Unusual captures are converted, with a report.
 
 import json
 import math
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -126,7 +127,7 @@ def test_reduced_images_of_record3d(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("away", [0.0, 5000.0])
 def test_points_of_record3d_move_with_the_poses(away: float, tmp_path: Path) -> None:
-    """Those of all files of a folder, also far from the origin; a point that a camera sees is where its ray leads."""
+    """Those of all files of a folder or a zip file, also far from the origin."""
     folder, expected = write_record3d(tmp_path / "recording"), POINTS + np.array([0.0, away, 0.0])
 
     def move(content: Content) -> None:
@@ -147,6 +148,20 @@ def test_points_of_record3d_move_with_the_poses(away: float, tmp_path: Path) -> 
     np.testing.assert_allclose(found, expected, atol=1e-5 + 1e-6 * away)
     with pytest.raises(DataError, match="has no PLY file"):
         convert_record3d(folder, tmp_path / "other", ply=folder)
+    with zipfile.ZipFile(tmp_path / "points.zip", "w") as archive:
+        archive.writestr("__MACOSX/walk/._0.ply", b"no points")
+        for file in (tmp_path / "points").iterdir():
+            archive.write(file, f"walk/{file.name}")
+    convert_record3d(folder, tmp_path / "of zip", ply=tmp_path / "points.zip")
+    names = sorted(path.name for path in (tmp_path / "of zip").iterdir())
+    assert names == ["images", "sparse_pc.ply", "transforms.json"]
+    written = (tmp_path / "out" / "sparse_pc.ply").read_bytes()
+    assert (tmp_path / "of zip" / "sparse_pc.ply").read_bytes() == written
+    with zipfile.ZipFile(tmp_path / "empty.zip", "w") as archive:
+        archive.writestr("readme.txt", b"no points")
+    with pytest.raises(DataError, match=r"empty\.zip has no PLY file"):
+        convert_record3d(folder, tmp_path / "nothing", ply=tmp_path / "empty.zip")
+    assert not (tmp_path / "nothing").exists()
 
 
 def test_images_that_are_not_taken_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

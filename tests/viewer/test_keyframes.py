@@ -62,6 +62,9 @@ def test_editing() -> None:
         full = full.added(edited.keyframes[0])
     assert len(full.keyframes) == MAX_KEYFRAMES
     assert Editor().path(64, 48, None) is None
+    video = Editor(edited.keyframes[:2]).path(64, 48, None)  # as it is at first: 2 s at 30 frames/s
+    assert video is not None
+    assert (len(video), video.fps) == (60, pytest.approx(30))
 
 
 def test_the_file_is_read_back(tmp_path: Path) -> None:

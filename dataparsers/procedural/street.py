@@ -249,7 +249,7 @@ def write_street(
             lit = lights(count, changing, seed) if training else [DAYLIGHT] * count
             for number, pose in enumerate(street_poses(split, count, houses, seed)):
                 name, passing = f"{split}_{number:05d}.png", traffic(pose, cars, random) if training else {}
-                known = {"mask_path": f"masks/{name}"} if training and cars else {}
+                known: dict[str, Any] = {"mask_path": f"masks/{name}"} if training and cars else {}
                 known |= _exposure(lit[number]) if changing.exposure else {}
                 stated = measured(pose, pose_error, errors) if training and pose_error else pose
                 frames.append({"file_path": f"images/{name}", **known, "transform_matrix": stated.tolist()})

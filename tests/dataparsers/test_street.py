@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -192,7 +193,7 @@ def test_errors_of_poses_are_as_large_as_stated_about_every_axis() -> None:
 
 @pytest.mark.medium
 def test_the_file_states_exposures_and_poses_with_errors_and_images_stay(tmp_path: Path) -> None:
-    changing, content = Changing(exposure=True), []
+    changing, content = Changing(exposure=True), list[Any]()
     for name, error in (("exact", 0.0), ("off", 0.05)):
         write_street(tmp_path / name, houses=HOUSES, size=8, counts=COUNTS, changing=changing, pose_error=error, seed=3)
         content.append(json.loads((tmp_path / name / "transforms.json").read_text())["frames"])

@@ -113,11 +113,15 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, Callable[[],
                 if folder.encode() in said and all(name in said.split(b"\0")[0] for name in names):
                     os.kill(int(words.parent.name), signal.SIGKILL)
 
+    def kill_head() -> None:
+        kill(b"gcs_server")
+        kill(b"raylet")
+
     start = ("start", "--head", "--port", str(port), "--num-cpus", "2", "--include-dashboard", "false")
     try:
         program = Path(sys.executable).with_name("ray")
         subprocess.run([program, *start, "--temp-dir", folder], check=True, capture_output=True)
-        yield f"127.0.0.1:{port}", lambda: (kill(b"gcs_server"), kill(b"raylet"))[0]
+        yield f"127.0.0.1:{port}", kill_head
     finally:
         kill()
         shutil.rmtree(folder, ignore_errors=True)

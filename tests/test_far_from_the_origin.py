@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from nerfloom import ParsedScene
+from nerfloom.blocks.block import Block
+from nerfloom.blocks.split import tree_blocks
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.dataset import load_dataset
@@ -22,6 +24,7 @@ from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import decimals, write_mesh
 from nerfloom.export.transforms import write_transforms as write_cameras
 from nerfloom.registry import load_method
+from nerfloom.training.block_plan import BlockPlan, block_placements, positions_of
 from nerfloom.training.run import TRANSFORMS, Run, write_transforms
 from tests.dataparsers.captures import moved, poses, write_capture
 
@@ -84,6 +87,34 @@ def test_a_run_accepts_its_own_data(
     assert capsys.readouterr().err == ""
     given = dataclasses.replace(run.parser, placement=tmp_path / TRANSFORMS)  # type: ignore[type-var]
     torch.testing.assert_close(given.parse(run.config.data, "val").cameras.camera_to_worlds, before, rtol=0, atol=1e-6)
+
+
+@CAPTURES
+def test_blocks_are_those_of_the_capture_at_the_origin(unit: float, shift: np.ndarray, tmp_path: Path) -> None:
+    """As of a drone's images in UTM: the run of each block reads the same cameras, by the placement in its file."""
+
+    def blocks_of(folder: Path, given: np.ndarray) -> tuple[list[Block], list[torch.Tensor]]:
+        data, parser = write_capture(folder / "capture", given=given), Nerfstudio()
+        run = Run(
+            "nerfacto", dataclasses.replace(load_method("nerfacto").config, data=data), "nerfstudio", parser, folder
+        )
+        parsed = parser.parse(data, "train")
+        found = tree_blocks(positions_of(parsed), 6, 0.3, 1)
+        placements = block_placements(run, parsed, tuple(found))
+        BlockPlan("nerfacto", (), tuple(found), placements, folder, "").claim_folder(parsed.placement)
+        files = [folder / "runs" / f"{number:03d}" / "placement.json" for number in range(len(found))]
+        read = [dataclasses.replace(parser, placement=file).parse(data, "train").cameras for file in files]
+        return found, [one.camera_to_worlds[list(block.cameras)] for one, block in zip(read, found, strict=True)]
+
+    here, near = blocks_of(tmp_path / "here", poses())
+    there, far = blocks_of(tmp_path / "there", moved(poses(), unit, shift))
+    assert len(here) > 1
+    assert [block.cameras for block in there] == [block.cameras for block in here]
+    for one, other in zip(there, here, strict=True):
+        np.testing.assert_allclose(one.center, unit * np.array(other.center) + shift, rtol=0, atol=within(unit))
+        assert one.radius == pytest.approx(unit * other.radius, rel=1e-5)
+    for seen, expected in zip(far, near, strict=True):
+        torch.testing.assert_close(seen, expected, rtol=0, atol=3e-6)
 
 
 def test_a_scene_that_is_left_where_it_is_is_said_to_be_far(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

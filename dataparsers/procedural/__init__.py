@@ -17,6 +17,7 @@ from nerfloom import DataError, DataParser, ParsedScene
 from nerfloom.base.console import say
 from nerfloom.base.splits import Split
 from nerfloom.base.user_cache import cache_folder
+from nerfloom.data.scene import PoseSource
 from nerfloom.dataparsers.blender import Blender
 
 VERSION = 1
@@ -25,6 +26,8 @@ MAX_DISTRACTORS = 0.4
 """Maximum share of pixels that distractors can cover on average."""
 MAX_HOUSES, MAX_CARS = 1000, 20
 """Maximum number of houses on each side of the street, and of cars near a camera."""
+MAX_POSE_ERROR = 0.2
+"""Maximum error of a pose, scene units and radians."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,9 @@ class Procedural(DataParser):
     """Whether training images of the courtyard or the street differ in white balance."""
     changing_sun: bool = False
     """Whether the position of the sun differs between training images of the courtyard or the street."""
+    pose_error: float = 0.0
+    """Error of the street's training poses, as from a device: standard deviation along and about each axis, in scene
+    units and radians, from 0 to 0.2. Images and test poses are exact."""
     views_per_scene: int = 12
     """Images of each random scene. In a held-out scene, every fourth is evaluated and the others are sources."""
     placement: Path | None = None
@@ -82,7 +88,8 @@ class Procedural(DataParser):
         if self.street:
             from nerfloom.dataparsers.nerfstudio import Nerfstudio
 
-            parsed = Nerfstudio(placement=self.placement, poses="exact").parse(folder, split)
+            poses: PoseSource = "device" if self.pose_error else "exact"
+            parsed = Nerfstudio(placement=self.placement, poses=poses).parse(folder, split)
             return replace(parsed, appearance_varies=any(self._changing))
         if self.courtyard:
             from nerfloom.dataparsers.procedural.courtyard import HALF
@@ -116,6 +123,10 @@ class Procedural(DataParser):
             raise DataError("--distractors applies to the courtyard only: add --courtyard True")
         if not self.street and self.cars:
             raise DataError("--cars applies to the street only: add --street 8")
+        if not 0 <= self.pose_error <= MAX_POSE_ERROR:
+            raise DataError(f"--pose-error is {self.pose_error}; it must be from 0 to {MAX_POSE_ERROR}")
+        if not self.street and self.pose_error:
+            raise DataError("--pose-error applies to the street only: add --street 8")
         if not (self.courtyard or self.street) and any(self._changing):
             raise DataError("--changing-* apply to the courtyard and the street: add --courtyard True or --street 8")
 
@@ -128,7 +139,8 @@ class Procedural(DataParser):
         if self.courtyard:
             kind = f"courtyard{self.distractors:g}{differs}"
         if self.street:
-            kind = f"street{self.street}-{self.cars}cars{differs}"
+            errors = f"-{self.pose_error:g}off" if self.pose_error else ""
+            kind = f"street{self.street}-{self.cars}cars{f'-{differs}' if differs else ''}{errors}"
         folder = cache_folder() / f"procedural-v{VERSION}-{kind}-{self.size}px-{count}-seed{self.scene_seed}"
         if not folder.is_dir():
             say(f"rendering {'the embedded scene' if self.num_scenes == 1 else 'random scenes'} into {folder}")
@@ -159,6 +171,7 @@ class Procedural(DataParser):
                 counts=counts,
                 cars=self.cars,
                 changing=Changing(*self._changing),
+                pose_error=self.pose_error,
                 seed=self.scene_seed,
             )
             return

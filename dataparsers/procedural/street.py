@@ -2,7 +2,7 @@
 
 Coordinates are scene units with x along the road and z up; the ground is at height 0. Cameras drive along the road and
 look ahead and to both sides. `write_street` takes photographs in nerfstudio's format, with cars that are elsewhere in
-each image, and masks with the truth about them.
+each image, and masks with the truth about them. Its file can state exposures, and poses with errors as from a device.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from nerfloom.dataparsers.procedural.scene import (
 )
 from nerfloom.dataparsers.procedural.shapes import Box, Union
 from nerfloom.dataparsers.procedural.views import complete_folder, in_parallel, render_view
+from nerfloom.kernels.math import cross_matrix
 
 ANGLE = math.radians(75.0)
 """Horizontal field of view of the cameras, radians."""
@@ -45,6 +46,8 @@ EYE = 0.55
 """Height of the cameras."""
 YAWS = (0.0, math.radians(75.0), math.radians(-75.0))
 """Directions of the cameras in turn: ahead, to the left, to the right."""
+SHUTTER, F_NUMBER, ISO = 0.01, 2.0, 100.0
+"""Exposure time (s), f-number and sensitivity of images in daylight."""
 _WINDOW = (0.62, 0.72)  # width and height of a cell of a front that holds a window
 _CAR = Union((
     (Box((0.42, 0.19, 0.10)), (0.0, 0.0, 0.17)),
@@ -148,6 +151,22 @@ def street_poses(split: str, count: int, houses: int, seed: int) -> list[npt.NDA
     return poses
 
 
+def measured(pose: npt.NDArray[np.float64], error: float, random: np.random.Generator) -> npt.NDArray[np.float64]:
+    """Return a pose (4, 4) as a device might measure it.
+
+    Args:
+        pose: (4, 4) camera-to-world matrix.
+        error: standard deviation of each coordinate of the position, scene units, and of each of the three numbers of
+            a rotation (axis times angle, radians).
+        random: source of the errors.
+    """
+    position, turn = random.normal(0.0, error, 3), random.normal(0.0, error, 3)
+    found = pose.copy()
+    found[:3, :3] = torch.linalg.matrix_exp(cross_matrix(torch.from_numpy(turn))).numpy() @ pose[:3, :3]
+    found[:3, 3] += position
+    return found
+
+
 def traffic(pose: npt.NDArray[np.float64], count: int, random: np.random.Generator) -> dict[str, Part]:
     """Return up to `count` cars near the camera `pose` (4, 4), in both lanes, with `random` places and colours."""
     found: dict[str, Part] = {}
@@ -197,13 +216,14 @@ def write_street(
     counts: dict[str, int] | None = None,
     cars: int = 0,
     changing: Changing,
+    pose_error: float = 0.0,
     seed: int = 0,
 ) -> None:
     """Write photographs of a street in nerfstudio's format, completely or not at all.
 
     Validation and test images are without cars and in daylight. Test images have `geometry/NAME.npz` with the exact
     depth (H, W) along the ray, inf for the sky, and the world normals (H, W, 3). With cars, each training image has a
-    mask, black where a car or its shadow changes a colour.
+    mask, black where a car or its shadow changes a colour. If exposures change, the file states each one.
 
     Args:
         folder: folder to create. If another process creates it meanwhile, its content is kept.
@@ -212,13 +232,15 @@ def write_street(
         counts: number of images of the splits train, val and test.
         cars: maximum number of cars near the camera of each training image.
         changing: the properties that differ between training images.
-        seed: seed of houses, cameras, cars and light. The same seed gives the same bytes.
+        pose_error: error of the training poses in the file, as in `measured`. Images and other poses do not change.
+        seed: seed of houses, cameras, cars, light and errors. The same seed gives the same bytes.
 
     Raises:
         OSError: if the folder cannot be written.
     """
     counts, parts = counts or {"train": 80, "val": 8, "test": 16}, street(houses, seed)
     random, frames, jobs = np.random.default_rng([seed, 12]), list[dict[str, Any]](), list[tuple[Any, ...]]()
+    errors = np.random.default_rng([seed, 13])
     with complete_folder(folder) as temporary:
         for kind in ("images", "geometry", *(("masks",) if cars else ())):
             (temporary / kind).mkdir(parents=True)
@@ -227,11 +249,18 @@ def write_street(
             lit = lights(count, changing, seed) if training else [DAYLIGHT] * count
             for number, pose in enumerate(street_poses(split, count, houses, seed)):
                 name, passing = f"{split}_{number:05d}.png", traffic(pose, cars, random) if training else {}
-                mask = {"mask_path": f"masks/{name}"} if training and cars else {}
-                frames.append({"file_path": f"images/{name}", **mask, "transform_matrix": pose.tolist()})
+                known: dict[str, Any] = {"mask_path": f"masks/{name}"} if training and cars else {}
+                known |= _exposure(lit[number]) if changing.exposure else {}
+                stated = measured(pose, pose_error, errors) if training and pose_error else pose
+                frames.append({"file_path": f"images/{name}", **known, "transform_matrix": stated.tolist()})
                 jobs.append((temporary, frames[-1], pose, size, parts, passing, lit[number]))
         _write_transforms(temporary, size, frames, list(counts))
         in_parallel(_write_photograph, jobs, "Photographing the street")
+
+
+def _exposure(lit: Light) -> dict[str, float]:
+    """Return the entries of a frame for the exposure of an image; white balance leaves green unchanged."""
+    return {"exposure_time": SHUTTER * lit.gains[1], "f_number": F_NUMBER, "iso": ISO}
 
 
 def _write_transforms(folder: Path, size: int, frames: list[dict[str, Any]], splits: list[str]) -> None:

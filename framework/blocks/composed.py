@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from threading import Lock
 from typing import NamedTuple
 
 import torch
@@ -178,9 +179,21 @@ def few_in_memory(opened: Callable[[int], Opened], kept: int = KEPT) -> Callable
 
     Args:
         opened: loads a block, given its number.
-        kept: number of blocks that are kept. The one that was not used for longest leaves.
+        kept: maximum number of blocks in memory. The one that was not used for longest leaves before another is loaded.
     """
-    return lru_cache(maxsize=kept)(opened)
+    held, lock = OrderedDict[int, Opened](), Lock()
+
+    def of(number: int) -> Opened:
+        with lock:
+            if number in held:
+                held.move_to_end(number)
+            else:
+                while len(held) >= kept:
+                    held.popitem(last=False)
+                held[number] = opened(number)
+            return held[number]
+
+    return of
 
 
 def _worth_drawing(shares: Tensor) -> list[int]:

@@ -78,7 +78,7 @@ def _cluster(address: str | None) -> Iterator[Any]:
         options |= {"num_cpus": num_cores(), "include_dashboard": False}
     try:
         ray.init(address or "local", **options)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except Exception as error:  # Ray raises plain ones too, such as of a head that does not start in time
         what = "cannot start Ray here" if address is None else f"--ray-address {address}: cannot connect"
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ConfigError(f"{what}: {first}") from error
@@ -172,7 +172,8 @@ def _goes_on(job: Job, lost: int, error: Exception, ledger: Ledger) -> bool:
     if lost > MAX_LOST:
         ledger.ended(job, f"it lost {lost} workers, the last by {_first_line(error)}")
         return False
-    say(f"  {job.title}: worker lost ({_first_line(error)}); the job continues on another, {lost} of {MAX_LOST}")
+    why = _first_line(error).partition(". ")[0]  # then comes a paragraph about Ray's own commands
+    say(f"  {job.title}: worker lost ({why}); the job continues on another, {lost} of {MAX_LOST}")
     return True
 
 

@@ -16,6 +16,7 @@ from nerfloom.blocks.split import grid_blocks
 from nerfloom.blocks.visibility import Visibility
 from nerfloom.cameras.poses import Placement
 from nerfloom.training.block_plan import BlockPlan
+from tests.training.helpers import tiny_trainer
 
 ROOT = Path(__file__).parents[2]
 
@@ -89,3 +90,15 @@ def test_what_was_not_measured_is_said(tmp_path: Path) -> None:
 def test_inputs_out_of_range_are_refused(name: str, wrong: float) -> None:
     with pytest.raises(FlagError, match=f"--{name} is"):
         City(**{name: wrong})  # type: ignore[arg-type]
+
+
+@pytest.mark.medium
+def test_a_checkpoint_has_three_numbers_of_a_parameter(shared_tiny: Path, tmp_path: Path) -> None:
+    """The page counts 12 bytes: the parameter, and Adam's two moments. Cells of empty space and the like add little."""
+    trainer = tiny_trainer("nerfacto", shared_tiny, tmp_path / "run", log2_table_size=16)
+    trainer.train_step()
+    parameters = sum(values.numel() for values in trainer.model.parameters())
+    path = trainer.save()
+    assert path is not None
+    assert path.stat().st_size == pytest.approx(12 * parameters, rel=0.06)
+    assert value("two checkpoints of a block", City(), Measured(parameters=float(10**6))) == "24 MB"

@@ -4,21 +4,26 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from nerfloom.base.errors import DataError
+from nerfloom.data.exposure import exposures_of
+from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.dataparsers.procedural import Procedural
-from nerfloom.dataparsers.procedural.photographs import Changing
+from nerfloom.dataparsers.procedural.photographs import Changing, lights
 from nerfloom.dataparsers.procedural.scene import Hit, Parts, trace_rows
 from nerfloom.dataparsers.procedural.street import (
     ANGLE,
     FACE,
     LOT,
+    measured,
     photograph,
     street,
     street_poses,
@@ -174,6 +179,41 @@ def test_the_street_is_read_as_a_capture_whose_placement_can_be_given(tmp_path: 
     torch.testing.assert_close(*back, atol=1e-5, rtol=1e-5)
 
 
+def test_errors_of_poses_are_as_large_as_stated_about_every_axis() -> None:
+    """The spread of 400 errors, whatever way a camera looks; a rotation's error is its axis times its angle."""
+    random, pose = np.random.default_rng(0), street_poses("train", 5, HOUSES, 0)[1]
+    found = np.stack([measured(pose, 0.05, random) for _ in range(400)])
+    np.testing.assert_allclose((found[:, :3, 3] - pose[:3, 3]).std(0), 0.05, rtol=0.15)
+    turned = found[:, :3, :3] @ pose[:3, :3].T
+    np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (400, 3, 3)), atol=1e-10)
+    angles = Rotation.from_matrix(turned).as_rotvec()
+    np.testing.assert_allclose(angles.std(0), 0.05, rtol=0.15)
+    np.testing.assert_allclose(angles.mean(0), 0, atol=0.01)
+
+
+@pytest.mark.medium
+def test_the_file_states_exposures_and_poses_with_errors_and_images_stay(tmp_path: Path) -> None:
+    changing, content = Changing(exposure=True), list[Any]()
+    for name, error in (("exact", 0.0), ("off", 0.05)):
+        write_street(tmp_path / name, houses=HOUSES, size=8, counts=COUNTS, changing=changing, pose_error=error, seed=3)
+        content.append(json.loads((tmp_path / name / "transforms.json").read_text())["frames"])
+    for exact, off in zip(*content, strict=True):
+        same, training = exact["transform_matrix"] == off["transform_matrix"], "train_" in exact["file_path"]
+        assert same != training
+        image = exact["file_path"]
+        assert (tmp_path / "exact" / image).read_bytes() == (tmp_path / "off" / image).read_bytes()
+    poses = np.stack([frame["transform_matrix"] for frame in content[0][: COUNTS["train"]]])
+    np.testing.assert_allclose(poses, np.stack(street_poses("train", COUNTS["train"], HOUSES, 3)))
+    taken = Nerfstudio().parse(tmp_path / "off", "train").taken
+    stops = torch.tensor([math.log2(lit.gains[1]) for lit in lights(COUNTS["train"], changing, 3)])
+    found = exposures_of(taken)
+    assert found is not None
+    torch.testing.assert_close(found, stops - stops.mean(), atol=1e-5, rtol=0)
+    parsed = Procedural(street=2, size=16, num_train=6, pose_error=0.05).parse(None, "train")
+    assert parsed.poses == "device"
+    assert parsed.taken is None
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -184,6 +224,8 @@ def test_the_street_is_read_as_a_capture_whose_placement_can_be_given(tmp_path: 
         Procedural(street=2, courtyard=True),
         Procedural(street=2, distractors=0.1),
         Procedural(street=2, num_scenes=3),
+        Procedural(street=2, pose_error=0.3),
+        Procedural(pose_error=0.01),
     ],
 )
 def test_flags_that_do_not_fit_are_refused(wrong: Procedural) -> None:

@@ -17,15 +17,18 @@ import torch
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import CheckpointError, ConfigError
 from nerfloom.cli import evaluate as eval_command
+from nerfloom.cli.job_flags import JobFlags
 from nerfloom.cli.session import resume
 from nerfloom.cli.session import start as start_session
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.evaluation.images import write_image
+from nerfloom.jobs.job import Step
 from nerfloom.training.checkpoint import FOLDER
 from nerfloom.training.run import create_folder, read_run, write_report
 from tests.conftest import Refused
 from tests.faults.conftest import Disk
 from tests.faults.runs import ended, readable_steps, start
+from tests.jobs.tiny import files, job, program
 from tests.training.helpers import tiny_run, tiny_trainer
 
 
@@ -195,3 +198,26 @@ def test_a_disk_that_is_full_from_the_start(shared_tiny: Path, tmp_path: Path, d
     a_run = tiny_run("instant-ngp", shared_tiny, tmp_path / "disk" / "run")
     with pytest.raises(ConfigError, match=r"cannot write the run's folder .*: No space left on device"):
         create_folder(a_run)
+
+
+@pytest.mark.parametrize("launcher", ["processes", pytest.param("ray", marks=pytest.mark.slow)])
+def test_jobs_on_a_disk_that_fills_up(launcher: Any, tmp_path: Path, disk: Disk) -> None:
+    """A real disk, too small for one of the results. What was finished stays, and the same call finishes the rest."""
+    if launcher == "ray":
+        pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
+    folder = tmp_path / "disk"
+    half, result = folder / "large.part", folder / "large.txt"
+    large = program(
+        f"pathlib.Path({str(half)!r}).write_text(300_000 * 'x')\nos.replace({str(half)!r}, {str(result)!r})"
+    )
+    jobs = [job(folder, "first"), job(folder, "large", Step(large)), job(folder, "last")]
+    disk("size=200k")
+    failures = JobFlags(launcher=launcher, jobs=1).chosen_launcher(folder).run(jobs)
+    assert "large" in [failed.title for failed in failures]
+    assert files(folder)["first.txt"] == "first"
+    assert not result.exists()
+    kept = (folder / "first.txt").stat().st_mtime_ns
+    disk("size=64m")
+    assert JobFlags(launcher=launcher, jobs=1).chosen_launcher(folder).run(jobs) == {}
+    assert files(folder) == {"first.txt": "first", "large.txt": 300_000 * "x", "last.txt": "last"}
+    assert (folder / "first.txt").stat().st_mtime_ns == kept

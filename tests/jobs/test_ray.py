@@ -1,7 +1,14 @@
 """Jobs on a real Ray cluster, started on this machine."""
 
+import os
+import shutil
 import signal
+import socket
 import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -14,7 +21,7 @@ from nerfloom.jobs.job import Job
 from nerfloom.jobs.processes import Processes
 from nerfloom.jobs.ray import Ray
 from tests.jobs.tiny import driver, files, job, long_job, write
-from tests.patience import until
+from tests.patience import PATIENCE, until
 
 pytestmark = pytest.mark.slow  # a cluster starts within seconds
 
@@ -59,7 +66,10 @@ def test_two_workers_of_which_one_is_killed_three_times(tmp_path: Path, capsys: 
     lost = [line for line in capsys.readouterr().err.splitlines() if "worker lost" in line]
     print("\n".join(lost))
     assert len(lost) == 3
-    assert all("unlucky" in line for line in lost)
+    died = "worker lost (WorkerCrashedError: The worker died unexpectedly while executing this task)"
+    assert [line.strip() for line in lost] == [
+        f"unlucky: {died}; the job continues on another, {number} of 5" for number in (1, 2, 3)
+    ]
     Processes().run([job(one, name) for name in ("a", "b", "unlucky")] + [job(one, "bad", code=bad), job(one, "last")])
     assert files(other) == files(one)
     assert (other / "logs" / "last.log").read_text().endswith("last\n")
@@ -85,6 +95,65 @@ def test_what_ends_the_head_lets_the_job_save_and_the_same_call_goes_on(number: 
     assert Ray().run([job(tmp_path, "first"), long_job(tmp_path, "second")]) == {}
     assert files(tmp_path) == {"first.txt": "first", "second.txt": "second"}
     assert (tmp_path / "first.txt").stat().st_mtime_ns == kept
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, Callable[[], None]]]:
+    """The address of a running cluster, and a function that kills its head: Ray's gcs_server and raylet."""
+    monkeypatch.setenv("RAY_raylet_start_wait_time_s", str(PATIENCE))
+    monkeypatch.setenv("RAY_gcs_rpc_server_reconnect_timeout_s", "2")  # otherwise commands wait for the head for 60 s
+    folder = tempfile.mkdtemp(prefix="ray")  # paths of Ray's sockets must be short
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+
+    def kill(*names: bytes) -> None:
+        for words in Path("/proc").glob("[0-9]*/cmdline"):
+            with suppress(OSError):  # it has ended
+                said = words.read_bytes()
+                if folder.encode() in said and all(name in said.split(b"\0")[0] for name in names):
+                    os.kill(int(words.parent.name), signal.SIGKILL)
+
+    def kill_head() -> None:
+        kill(b"gcs_server")
+        kill(b"raylet")
+
+    start = ("start", "--head", "--port", str(port), "--num-cpus", "2", "--include-dashboard", "false")
+    try:
+        program = Path(sys.executable).with_name("ray")
+        subprocess.run([program, *start, "--temp-dir", folder], check=True, capture_output=True)
+        yield f"127.0.0.1:{port}", kill_head
+    finally:
+        kill()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="looks for processes in /proc")
+def test_a_killed_head_of_a_running_cluster_loses_nothing(
+    cluster: tuple[str, Callable[[], None]], tmp_path: Path
+) -> None:
+    address, kill = cluster
+    words, environment = driver(tmp_path, "ray", address)
+    process = subprocess.Popen(words, env=environment, stderr=subprocess.DEVNULL)
+    until(lambda: (tmp_path / "second.begun").exists() and (tmp_path / "first.txt").exists())
+    kept = (tmp_path / "first.txt").stat().st_mtime_ns
+    kill()
+    until((tmp_path / "second.saved").exists)
+    assert process.wait(PATIENCE) != 0
+    assert files(tmp_path) == {"first.txt": "first"}
+    assert Processes().run([job(tmp_path, "first"), long_job(tmp_path, "second")]) == {}
+    assert files(tmp_path) == {"first.txt": "first", "second.txt": "second"}
+    assert (tmp_path / "first.txt").stat().st_mtime_ns == kept
+
+
+def test_a_cluster_that_does_not_start_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray raises a plain Exception where its processes do not start in time, as on a busy machine."""
+
+    def late(*_: object, **__: object) -> None:
+        raise Exception("The current node timed out during startup. This could happen because\nof much")
+
+    monkeypatch.setattr("ray.init", late)
+    with pytest.raises(ConfigError, match=r"^cannot start Ray here: The current node timed out during startup\."):
+        Ray().run([job(tmp_path, "a")])
 
 
 def test_machines_that_see_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

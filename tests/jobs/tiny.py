@@ -44,14 +44,14 @@ from pathlib import Path
 from tests.jobs.tiny import job, long_job
 from nerfloom.cli.common import run_command
 from nerfloom.cli.job_flags import JobFlags
-folder = Path(sys.argv[1])
-run_command(lambda _: JobFlags(launcher=sys.argv[2]).chosen_launcher(folder).run(
+folder, launcher, address = Path(sys.argv[1]), sys.argv[2], next(iter(sys.argv[3:]), None)
+run_command(lambda _: JobFlags(launcher=launcher, ray_address=address).chosen_launcher(folder).run(
     [job(folder, "first"), long_job(folder, "second")]))
 """
-"""Program with a folder and a launcher's name as arguments: a short job, then a long one."""
+"""Program with a folder, a launcher's name and perhaps Ray's address as arguments: a short job, then a long one."""
 
 
-def driver(folder: Path, launcher: str) -> tuple[list[str], dict[str, str]]:
+def driver(folder: Path, launcher: str, *address: str) -> tuple[list[str], dict[str, str]]:
     """The command line of `DRIVER`, and its environment."""
     root = str(Path(__file__).parents[2])
-    return [sys.executable, "-c", DRIVER, str(folder), launcher], {**os.environ, "PYTHONPATH": root}
+    return [sys.executable, "-c", DRIVER, str(folder), launcher, *address], {**os.environ, "PYTHONPATH": root}

@@ -1,4 +1,4 @@
-"""docs/plug-and-play.md is true: its code runs, in the order of the page, with the described results."""
+"""docs/plug-and-play.md and the page after it are true: their code runs, in its order, with the described results."""
 
 import re
 
@@ -7,11 +7,11 @@ import torch
 
 from tests.plug_and_play.test_examples import ROOT, differences
 
-PAGE = (ROOT / "docs" / "plug-and-play.md").read_text()
+PAGE = "".join((ROOT / "docs" / f"{name}.md").read_text() for name in ("plug-and-play", "plug-and-play-more"))
 
 
 def blocks(language: str) -> list[str]:
-    """The page's code in a language, and where it stands, so that a traceback names the line."""
+    """The code of both pages in a language, at its line in their joined text."""
     found = re.finditer(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     return ["\n" * PAGE[: match.start(1)].count("\n") + match[1] for match in found]
 

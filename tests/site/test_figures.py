@@ -156,7 +156,7 @@ def test_methods_of_nerfstudio_are_those_that_are_answered() -> None:
 
 
 def test_every_data_format_is_named() -> None:
-    text = (DOCS / "guides" / "poses.md").read_text()
+    text = (DOCS / "guides" / "formats.md").read_text()
     entries = registered("dataparsers").items()
     built_in = [name for name, entry in entries if entry.module.startswith("nerfloom.dataparsers.")]
     assert [name for name in built_in if f"`{name}`" not in text] == []

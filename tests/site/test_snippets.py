@@ -98,6 +98,7 @@ def test_pages_with_programs_are_executed() -> None:
     """Python that calls `nerfloom` or makes a METHOD is run by some test, not only compiled."""
     run_elsewhere = {
         "plug-and-play",
+        "plug-and-play-more",
         "guides/add-a-format",
         "guides/add-a-method",
         "guides/edit",

@@ -30,7 +30,7 @@ def test_names_are_unique_and_the_help_lists_them_all() -> None:
 
 
 def test_the_document_says_what_each_may_lose() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "stability.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "notes" / "stress.md").read_text(encoding="utf-8")
     table = text.split("| condition | dB that may be lost, and why |\n")[1].split("\n\n")[0]
     rows = [line.split("|")[1:3] for line in table.splitlines()]
     said = {name.strip(): allowed.strip() for names, allowed in rows for name in names.split(",")}

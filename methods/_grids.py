@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from nerfloom.base.config import AT_LEAST_0, Range
 from nerfloom.base.decisions import Choice
@@ -11,17 +11,20 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.data.scene import Scene
 from nerfloom.encodings.hash_grid import HashGridConfig
 
+GRID_WIDTH = 64
+"""Features per hidden layer of the networks on the grids."""
+
 
 @dataclass(frozen=True)
 class GridsConfig(HashGridConfig):
     """Settings of the hash grids that `--encoding hash-grid` selects."""
 
-    RANGES: ClassVar[dict[str, Range]] = {"grid_learning_rate": AT_LEAST_0, "grid_width": (1, 2**14)}
+    RANGES: ClassVar[dict[str, Range]] = {"grid_learning_rate": AT_LEAST_0}
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {"grid_width": GRID_WIDTH}
+    """Settings of earlier versions."""
     grid_learning_rate: float = 1e-2
     """Initial learning rate of the hash grids and of the networks on them (hash-grid)."""
-    grid_width: int = 64
-    """Features per hidden layer of the networks on the grids (hash-grid)."""
 
 
 def grid_optimiser(config: GridsConfig, name: str = "grids") -> Optimised:

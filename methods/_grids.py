@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from nerfloom.base.config import AT_LEAST_0, Range
 from nerfloom.base.decisions import Choice
@@ -13,18 +13,20 @@ from nerfloom.encodings.hash_grid import HashGridConfig
 
 SMALL_TABLE, LARGE_TABLE, SMALL_UP_TO = 17, 19, 512
 """Base-2 logarithms of the entries of a level, and the largest number of finest cells along an axis for the first."""
+GRID_WIDTH = 64
+"""Features per hidden layer of the networks on the grids."""
 
 
 @dataclass(frozen=True)
 class GridsConfig(HashGridConfig):
     """Settings of the hash grids that `--encoding hash-grid` selects."""
 
-    RANGES: ClassVar[dict[str, Range]] = {"grid_learning_rate": AT_LEAST_0, "grid_width": (1, 2**14)}
+    RANGES: ClassVar[dict[str, Range]] = {"grid_learning_rate": AT_LEAST_0}
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {"grid_width": GRID_WIDTH}
+    """Settings of earlier versions."""
     grid_learning_rate: float = 1e-2
     """Initial learning rate of the hash grids and of the networks on them (hash-grid)."""
-    grid_width: int = 64
-    """Features per hidden layer of the networks on the grids (hash-grid)."""
 
 
 def grid_optimiser(config: GridsConfig, name: str = "grids") -> Optimised:

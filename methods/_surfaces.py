@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -59,6 +59,8 @@ from nerfloom.training.ray_starts import nearest_shown
 
 SHARPER = 50.0
 """Upper bound of the inverse width just before the bound is lifted, relative to the first inverse width."""
+SHARPNESS_RATE = 5e-3
+"""Learning rate of a tenth of the logarithm of the inverse width. 1e-3 was worse (docs/notes/surfaces.md)."""
 SAMPLES = {"hash-grid": 2**15, "frequency": 2**13}
 """Samples per training step with an occupancy grid."""
 COLOR_LAYERS = 4
@@ -105,12 +107,13 @@ class SurfaceConfig(
         "curvature_until": (0, 1),
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
-        "sharpness_learning_rate": AT_LEAST_0,
         "sharpen_until": (0, 1),
         "step_widths": AT_LEAST_0,
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {"sharpness_learning_rate": SHARPNESS_RATE}
+    """Settings of earlier versions."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the papers' networks, of 8 layers for the distance and 4 for
     the colour, for GPUs."""
@@ -155,8 +158,6 @@ class SurfaceConfig(
     background, otherwise 0.25."""
     start_sharpness: float = 20.0
     """First inverse width of the surface; the width is in halves of the box's shortest edge."""
-    sharpness_learning_rate: float = 5e-3
-    """Learning rate of a tenth of the logarithm of the inverse width."""
     step_widths: float = 2.0
     """Length of a training step in widths of the surface, limited to one to four steps of --num-steps. 0: one step."""
     eval_rendering: Literal["volume", "surface"] = "volume"
@@ -235,7 +236,7 @@ def surface_field(
     return kind(
         box,
         distance,
-        sharpness(config.start_sharpness / distance.size, config.sharpness_learning_rate),
+        sharpness(config.start_sharpness / distance.size, SHARPNESS_RATE),
         config.hidden_width,
         COLOR_LAYERS if large else 1,
         color_bias=large,

@@ -34,7 +34,7 @@ from nerfloom.methods._captures import (
     refined_sampler_choice,
     refinement_choice,
 )
-from nerfloom.methods._grids import GridsConfig, grid_optimiser
+from nerfloom.methods._grids import GRID_WIDTH, GridsConfig, grid_optimiser
 from nerfloom.samplers.choice import (
     COARSEST_PROPOSAL,
     contracted_box,
@@ -153,7 +153,7 @@ def make_field(config: MipNeRF360Config, scene: Scene) -> Field:
             direction_frequencies=config.direction_frequencies,
         )
     unbounded = contracted_box(config, scene) is not None
-    field = SizedField(scene.box, MultisampledHashGrid.of(config), config.grid_width, unbounded=unbounded)
+    field = SizedField(scene.box, MultisampledHashGrid.of(config), GRID_WIDTH, unbounded=unbounded)
     field.optimised = grid_optimiser(config, "grid")
     return field
 

@@ -18,7 +18,7 @@ from nerfloom.fields.encoded import EncodedField
 from nerfloom.fields.inverted import InvertedField
 from nerfloom.losses.few_images import decide_few_images
 from nerfloom.methods import vanilla_nerf
-from nerfloom.methods._grids import GridsConfig, grid_optimiser
+from nerfloom.methods._grids import GRID_WIDTH, GridsConfig, grid_optimiser
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_SAMPLES_PER_BATCH, OPEN_UNTIL, VanillaNeRFConfig
 from nerfloom.rendering.background import background_renderer
 from nerfloom.samplers.background import decide_background, foreground
@@ -52,7 +52,7 @@ def make_field(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
         return vanilla_nerf.make_field(config, scene)
     scene = foreground(config, scene)
     unbounded = contracted_box(config, scene) is not None
-    field = EncodedField(scene.box, _grid(config), config.grid_width, unbounded=unbounded)
+    field = EncodedField(scene.box, _grid(config), GRID_WIDTH, unbounded=unbounded)
     field.optimised = grid_optimiser(config)
     return field
 
@@ -61,7 +61,7 @@ def make_background(config: NeRFPlusPlusConfig, scene: Scene) -> Field:
     """Return the field outside the sphere, at points of the inverted sphere."""
     if config.encoding == "frequency":
         return vanilla_nerf.make_background(config, scene)
-    field = InvertedField(_grid(config), config.grid_width)
+    field = InvertedField(_grid(config), GRID_WIDTH)
     field.optimised = grid_optimiser(config)
     return field
 

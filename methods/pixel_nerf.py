@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -42,8 +42,8 @@ from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.samplers.hierarchical import MIN_COARSE, HierarchicalSampler
 from nerfloom.samplers.proposal import half_edge
 
-BLOCKS_AFTER = 2
-"""Residual blocks after the mean over views, as in the paper."""
+BLOCKS_BEFORE, BLOCKS_AFTER = 3, 2
+"""Residual blocks before and after the mean over views, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -62,19 +62,18 @@ class PixelNeRFConfig(
         "num_coarse_samples": (MIN_COARSE, 2**14),
         "num_fine_samples": (1, 2**14),
         "hidden_width": (2, 2**14),
-        "num_view_blocks": (1, 64),
         "position_frequencies": (0, MAX_FREQUENCIES),
         "encoder_widths": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {"num_view_blocks": BLOCKS_BEFORE}
+    """Settings of earlier versions."""
     num_coarse_samples: int = 32
     """Stratified intervals per ray (64 in the paper)."""
     num_fine_samples: int = 32
     """Intervals per ray drawn from the weights of the coarse ones (16, and 16 around the depth, in the paper)."""
     hidden_width: int = 64
     """Features per layer (512 in the paper)."""
-    num_view_blocks: int = 3
-    """Residual blocks before the mean over source views."""
     position_frequencies: int = 6
     """Number of frequencies in the encoding of positions, in the frames of the source cameras."""
     encoder_widths: tuple[int, ...] = (32, 32, 64)
@@ -224,9 +223,9 @@ def make_field(config: PixelNeRFConfig, scene: Scene) -> PixelAlignedField:
     """
     if scene.warped:
         raise ConfigError("pixel-nerf does not work in normalised device coordinates: use --ndc False")
-    blocks = config.num_view_blocks, BLOCKS_AFTER
     features, unit = sum(config.encoder_widths), half_edge(scene.box)
-    return PixelAlignedField(features, unit, config.hidden_width, *blocks, config.position_frequencies)
+    sizes = config.hidden_width, BLOCKS_BEFORE, BLOCKS_AFTER, config.position_frequencies
+    return PixelAlignedField(features, unit, *sizes)
 
 
 def sampler(config: PixelNeRFConfig, scene: Scene) -> Sampler:

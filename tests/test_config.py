@@ -25,6 +25,25 @@ def test_every_methods_config_survives_yaml(method: str) -> None:
     assert from_plain(load_method(method).config, yaml.safe_load(text), "text") == config
 
 
+@dataclass(frozen=True)
+class Younger(RayConfig):
+    GONE: typing.ClassVar[dict[str, object]] = {"blur_widths": (1, 2.5)}
+
+
+@dataclass(frozen=True)
+class Youngest(Younger):
+    GONE: typing.ClassVar[dict[str, object]] = {"blocks": 3}
+
+
+def test_files_with_settings_that_are_gone_are_read_if_nothing_changes() -> None:
+    text = yaml.safe_dump({"learning_rate": 0.5, "blur_widths": [1, 2.5], "blocks": 3})
+    assert from_plain(Youngest(), yaml.safe_load(text), "text") == Youngest(learning_rate=0.5)
+    with pytest.raises(ConfigError, match="text: 'blocks' is 4, but now it is always 3; leave it out"):
+        from_plain(Youngest(), {"blocks": 4}, "text")
+    with pytest.raises(ConfigError, match="unknown key 'blocks'"):
+        from_plain(Younger(), {"blocks": 3}, "text")
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [

@@ -18,6 +18,8 @@ from nerfloom.registry import Entry, load_method, registered
 
 PICTURES = Path(__file__).parents[1] / "pictures" / "methods"
 """Results of `method_pictures.py`."""
+AFTER_PICTURE = "\n## When to take it\n"
+"""Heading of a page written by hand that the picture stands before."""
 
 
 def methods() -> dict[str, Entry]:
@@ -37,6 +39,7 @@ def page(name: str, text: str | None) -> str:
     module = sys.modules[registered("methods")[name].module]
     documentation = inspect.getdoc(module) or ""
     start = text if text is not None else f"# {name}\n\n{documentation}"
+    idea, heading, rest = start.partition(AFTER_PICTURE)
     facts = [
         "## In short",
         "",
@@ -48,8 +51,14 @@ def page(name: str, text: str | None) -> str:
         f"| draws | {'whole images' if method.model.batches == 'views' else 'rays through pixels'} |",
         f"| summary | {documentation.splitlines()[0] if documentation else ''} |",
     ]
-    head, _, rest = start.partition("\n\n")
-    parts = [head, rest.strip(), picture(name), "\n".join(facts), decided(method), flags(name, method)]
+    parts = [
+        idea.strip(),
+        picture(name),
+        (heading + rest).strip(),
+        "\n".join(facts),
+        decided(method),
+        flags(name, method),
+    ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -64,7 +73,7 @@ def picture(name: str) -> str:
         f"## Picture\n\n![photograph, render, error, depth and opacity](../pictures/methods/{name}.jpg)\n\n"
         "From left to right: a photograph that training never saw, the render, the error, depth and opacity. "
         f"`{run['command']}` on two cores beside other programs: {run['psnr']:.2f} dB on {run['images']} held-out "
-        f"images after {run['steps']:,} steps, one run. The figures above are of a quiet machine and more time."
+        f"images after {run['steps']:,} steps, in one run, which is no benchmark."
     )
 
 

@@ -63,6 +63,9 @@ class TrainConfig:
     }
     """Allowed ranges; a method's config adds or overrides some. Every range allows None; each number of a tuple is
     checked."""
+    GONE: ClassVar[dict[str, Any]] = {}
+    """Settings of earlier versions, each with the value that is used now. A method's config adds some. Files with
+    this value are read, so that old runs open; files with another are refused."""
     data: Path | None = None
     """Folder of the data set. Default: the embedded scene."""
     max_train_images: int | None = None

@@ -37,12 +37,18 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
         where: name of the source in error messages.
 
     Raises:
-        ConfigError: for an unknown key, with the nearest valid one, or a value of the wrong type.
+        ConfigError: for an unknown key, with the nearest valid one, for a value of the wrong type, or for a setting of
+            an earlier version (`GONE`) with another value than the one used now.
     """
     hints = typing.get_type_hints(type(default))
     names = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
+    gone = {name: value for kind in type(default).__mro__ for name, value in vars(kind).get("GONE", {}).items()}
     changes = {}
     for key, value in values.items():
+        if key in gone:
+            if value != to_plain(gone[key]):
+                raise ConfigError(f"{where}: '{key}' is {shown(value)}, but now it is always {gone[key]}; leave it out")
+            continue
         if key not in names:
             name = key if isinstance(key, str) else shown(key)
             raise ConfigError(f"{where}: unknown key {shown(name)}. {nearest(name, names)}")

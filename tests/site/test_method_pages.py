@@ -18,6 +18,8 @@ from tests.site.commands import Checker
 from tests.site.pages import ROOT, words_of
 
 BUILT_IN = [name for name, entry in registered("methods").items() if entry.module.startswith("nerfloom.methods.")]
+HEADINGS = ["Idea", "When to take it", "Settings that matter", "How it differs from the paper", "Measured"]
+SETTING = re.compile(r"^\| `--([\w-]+)` \| (.*?) \| (.*) \|$", re.MULTILINE)
 ROW = re.compile(r"^\| `--([\w.-]+)` \| (.*?) \| (.*?) \| (.*) \|$", re.MULTILINE)
 
 
@@ -79,15 +81,29 @@ def test_what_is_open_is_listed(method_pages: ModuleType, generated: Callable[[s
     assert all(rows[flag][0] in ("*decided by the data*", "`auto`") for flag in listed)
 
 
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_pages_have_one_form(generated: Callable[[str], str], name: str) -> None:
+    text = (ROOT / "docs" / "methods" / f"{name}.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## (.*)$", text, re.MULTILINE) == HEADINGS
+    assert len(text.splitlines()) <= 110
+    settings, rows = SETTING.findall(text), table(generated(name))
+    assert 3 <= len(settings) <= 8
+    for flag, default, _ in settings:
+        known = rows[flag][0]
+        assert default == known or (known.startswith("*") and "`" not in default), f"--{flag} is {known}"
+
+
 def test_a_method_without_a_text_of_its_own_has_a_page(method_pages: ModuleType) -> None:
     page = method_pages.page("instant-ngp", None)
     assert page.startswith("# instant-ngp\n\nInstant-NGP: a multiresolution hash grid")
     assert "[arXiv:2201.05989](https://arxiv.org/abs/2201.05989)" in page
 
 
-def test_a_text_of_its_own_comes_first(method_pages: ModuleType) -> None:
-    page = method_pages.page("kplanes", "# kplanes\n\nSix planes.\n")
-    assert page.index("Six planes.") < page.index("## In short") < page.index("## Flags")
+def test_a_text_of_its_own_comes_first_and_the_picture_behind_its_idea(method_pages: ModuleType) -> None:
+    page = method_pages.page("kplanes", "# kplanes\n\n## Idea\n\nSix planes.\n\n## When to take it\n\nFor motion.\n")
+    parts = ["Six planes.", "## Picture", "For motion.", "## In short", "## Flags"]
+    places = [page.index(part) for part in parts]
+    assert places == sorted(places)
 
 
 def test_a_picture_is_shown_with_the_run_that_made_it(

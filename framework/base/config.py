@@ -173,10 +173,7 @@ class TrainConfig:
             setattr(cls, name, value)
 
     def __post_init__(self) -> None:
-        ranges: dict[str, Range] = {}
-        for kind in reversed(type(self).__mro__):
-            ranges |= vars(kind).get("RANGES", {})
-        for name, (least, most) in ranges.items():
+        for name, (least, most) in in_all_bases(type(self), "RANGES").items():
             _check_range(name, getattr(self, name), least, most)
         if self.cache_limit is not None and not self.cache_limit >= 0:
             raise ConfigError(f"--cache-limit is {self.cache_limit}; it must be at least 0 MB")
@@ -300,6 +297,14 @@ class SourceViewsConfig(RayConfig):
     """Number of images that a view is rendered from."""
     images_per_batch: int = 4
     """Number of images that a training step draws pixels from; each is rendered from other images of its scene."""
+
+
+def in_all_bases(kind: type, name: str) -> dict[str, Any]:
+    """Return the dictionaries called `name` of a class and of its bases as one. A class overrides its bases."""
+    merged: dict[str, Any] = {}
+    for base in reversed(kind.__mro__):
+        merged |= vars(base).get(name, {})
+    return merged
 
 
 def _check_range(name: str, value: Any, least: float, most: float) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar, Union
 
 import yaml
 
-from nerfloom.base.config import AUTO
+from nerfloom.base.config import AUTO, in_all_bases
 from nerfloom.base.errors import ConfigError, nearest, one_line, shown
 from nerfloom.base.from_nerfstudio import config_answer
 
@@ -42,7 +42,7 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
     """
     hints = typing.get_type_hints(type(default))
     names = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
-    gone = {name: value for kind in type(default).__mro__ for name, value in vars(kind).get("GONE", {}).items()}
+    gone = in_all_bases(type(default), "GONE")
     changes = {}
     for key, value in values.items():
         if key in gone:

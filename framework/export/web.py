@@ -127,6 +127,38 @@ def upright(cameras: Cameras, z_is_up: bool) -> Tensor:
     return rotation_between(up, z)
 
 
+def held_upright(cameras: Cameras) -> Cameras:
+    """Return cameras whose images are turned by quarters until z is up in them, as a photograph from a turned phone is.
+
+    An image stays as it is if z is along none of its sides, as in a camera that looks straight down.
+
+    Args:
+        cameras: M pinhole cameras, in a frame with +z up.
+    """
+    poses = cameras.camera_to_worlds
+    right, up = poses[:, :, 0], poses[:, :, 1]
+    heights = torch.stack([up[:, 2], right[:, 2], -up[:, 2], -right[:, 2]], -1)
+    quarters = torch.where(heights.amax(-1) >= LEVEL, heights.argmax(-1), 0)[:, None]
+    # With 0, 1, 2 and 3 quarters, an image's new up is its old up, right, down and left.
+    axes = torch.where(quarters % 2 == 0, right, -up), torch.where(quarters % 2 == 0, up, right)
+    signs = torch.where(quarters < 2, 1, -1).to(poses)
+    turned = torch.stack([signs * axes[0], signs * axes[1], poses[:, :, 2], poses[:, :, 3]], -1)
+    lies, quarter = (quarters % 2 == 1)[:, 0], quarters[:, 0]
+    across, down = cameras.widths - cameras.cx, cameras.heights - cameras.cy
+    middle_x = torch.stack([cameras.cx, cameras.cy, across, down])
+    middle_y = torch.stack([cameras.cy, across, down, cameras.cx])
+    return replace(
+        cameras,
+        camera_to_worlds=turned,
+        fx=torch.where(lies, cameras.fy, cameras.fx),
+        fy=torch.where(lies, cameras.fx, cameras.fy),
+        cx=middle_x.gather(0, quarter[None])[0],
+        cy=middle_y.gather(0, quarter[None])[0],
+        widths=torch.where(lies, cameras.heights, cameras.widths),
+        heights=torch.where(lies, cameras.widths, cameras.heights),
+    )
+
+
 def pinhole(cameras: Cameras) -> Cameras:
     """Return pinhole cameras in the same places, which see about as much.
 

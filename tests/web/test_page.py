@@ -25,6 +25,7 @@ from nerfloom.export.web import (
     PICTURE,
     focus_of,
     gaussians_of,
+    held_upright,
     make_page,
     page,
     payload_of,
@@ -221,6 +222,31 @@ def test_up_is_up() -> None:
     torch.testing.assert_close(up / up.norm(), torch.tensor([0, 0, 1.0]).double())
     torch.testing.assert_close(turn @ turn.T, torch.eye(3).double())
     assert torch.equal(upright(turned, True), torch.eye(3).double())  # they look down, say
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_photographs_from_a_turned_phone_are_shown_upright(quarters: int) -> None:
+    """Each pixel has the same ray as in the image turned by `numpy.rot90`."""
+    turned = replace(some_cameras(2)[:1], widths=torch.tensor([200]), heights=torch.tensor([150]))
+    angle = torch.tensor(quarters * math.pi / 2 + 0.2)
+    about = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]])
+    poses = torch.cat([turned.camera_to_worlds[:, :, :3] @ about, turned.camera_to_worlds[:, :, 3:]], -1)
+    turned = replace(turned, camera_to_worlds=poses)
+    found = held_upright(turned)
+    pixels = np.stack(np.meshgrid(np.arange(200), np.arange(150)), -1)
+    pixels = torch.from_numpy(np.rot90(pixels, quarters).copy())
+    assert (int(found.widths), int(found.heights)) == (pixels.shape[1], pixels.shape[0])
+    rows, columns = torch.meshgrid(*(torch.arange(side) for side in pixels.shape[:2]), indexing="ij")
+    one = torch.zeros(rows.numel(), dtype=torch.int64)
+    new = found.rays(one, columns.flatten(), rows.flatten(), 0.0, 1.0)
+    old = turned.rays(one, pixels[..., 0].flatten(), pixels[..., 1].flatten(), 0.0, 1.0)
+    torch.testing.assert_close(new.directions, old.directions)
+    assert float(found.camera_to_worlds[0, 2, 1]) > 0.8
+
+
+def test_what_looks_straight_down_is_not_turned() -> None:
+    down = replace(some_cameras(1), camera_to_worlds=torch.eye(3, 4)[None])
+    assert torch.equal(held_upright(down).camera_to_worlds, down.camera_to_worlds)
 
 
 def test_cameras_look_at_the_focus() -> None:

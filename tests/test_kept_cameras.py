@@ -1,5 +1,8 @@
 """Cameras beside a file of Gaussians: where the photographs of a capture were taken from, however it is moved."""
 
+import dataclasses
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +11,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerfloom import edit
+from nerfloom import load as load_opened
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.kept_cameras import cameras_file, read_cameras, write_cameras
 from nerfloom.edit.edited import Edited
 from nerfloom.export.run_gaussians import export_gaussians
 from nerfloom.export.run_levels import export_file_levels
 from nerfloom.export.settings import LevelsSettings, SplatSettings
+from nerfloom.export.web import gaussians_of
 from nerfloom.renderable import training_poses
 from nerfloom.training.load import load
 from nerfloom.training.loaded import Loaded
@@ -75,6 +80,27 @@ def test_an_orbit_of_a_file_swings_where_its_photographs_were_taken(
     assert away.min() - 1e-4 < distances.min() < distances.max() < away.max() + 1e-4
     cosines = (given / away[:, None]) @ (-towards / distances[:, None]).T  # of photographs and frames
     assert np.degrees(np.arccos(cosines.max(0))).max() < 20
+
+
+def test_photographs_from_a_turned_phone_leave_a_page_level(edited: Edited, tmp_path: Path) -> None:
+    """Cameras turned by a quarter about their axes look the same way, and z stays up."""
+    pages = []
+    for name in ("level", "turned"):
+        edited.write(tmp_path / f"{name}.ply")
+        path = read_cameras(tmp_path / f"{name}.ply")
+        assert path is not None
+        if name == "turned":
+            quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+            axes = path.poses[:, :, :3] @ quarter
+            assert float(axes[:, 2, 1].abs().max()) < 0.5 < float(path.poses[:, 2, 1].min())
+            path = dataclasses.replace(path, poses=torch.cat([axes, path.poses[:, :, 3:]], -1))
+            write_cameras(tmp_path / f"{name}.ply", path)
+        load_opened(tmp_path / f"{name}.ply").export("web", tmp_path / f"{name}.html", title="A ball")
+        pages.append((tmp_path / f"{name}.html").read_text(encoding="utf-8"))
+    one, two = (json.loads(re.findall(r'id="facts"[^>]*>([^<]*)<', text)[0]) for text in pages)
+    for given, turned in zip(one["cameras"], two["cameras"], strict=True):
+        np.testing.assert_allclose(turned[1], given[1], atol=1e-5)
+    torch.testing.assert_close(gaussians_of(pages[0]).means, gaussians_of(pages[1]).means)
 
 
 def test_an_object_has_none_and_a_later_file_not_those_of_an_earlier_one(edited: Edited, tmp_path: Path) -> None:

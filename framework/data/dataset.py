@@ -81,8 +81,6 @@ class Dataset:
     """(M,) bool on the CPU, source images, for rendering others; they are not evaluated. None without."""
     training: bool = False
     """Whether these are training images, in the order of a model's vectors for them."""
-    z_is_up: bool = False
-    """Whether +z is up, as the data or their placement say; False if it is unknown."""
     normal_paths: tuple[Path | None, ...] | None = None
     """M files of true normals, read when asked for; None if there are none."""
     motion_bound: MotionBound | None = None
@@ -291,6 +289,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         moving=parsed.times is not None,
         image_size=int(torch.maximum(cameras.widths, cameras.heights).max()),
         unbounded=parsed.unbounded,
+        z_is_up=parsed.z_is_up,
         poses=parsed.poses,
         warped=isinstance(cameras, NdcCameras),
         has_depth=parsed.depth_paths is not None and decoded.mapped is None,
@@ -323,7 +322,6 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         scene_indices=parsed.scene_indices,
         source_images=parsed.source_images,
         training=split == "train",
-        z_is_up=parsed.z_is_up,
         normal_paths=parsed.normal_paths,
     )
 

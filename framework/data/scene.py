@@ -46,6 +46,8 @@ class Scene:
     """Whether there may be visible content outside `box`."""
     poses: PoseSource = "exact"
     """Source of the cameras' poses."""
+    z_is_up: bool = False
+    """Whether +z is up, as the data or their placement say; False if it is unknown."""
     warped: bool = False
     """Whether rays are in normalised device coordinates, with other lengths and angles than the scene."""
     has_depth: bool = False

@@ -80,9 +80,8 @@ def export_page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequ
     start = start_of([names[index] for index in order], settings.start_view)
     ranks = shown_cameras(len(order), start)
     chosen = torch.tensor([order[rank] for rank in ranks])
-    z_is_up = dataset is None or dataset.z_is_up  # files of Gaussians know what is up, or take z
-    cameras = held_upright(cameras) if z_is_up else cameras
-    turn = upright(cameras, z_is_up)
+    cameras = held_upright(cameras) if model.scene.z_is_up else cameras
+    turn = upright(cameras, model.scene.z_is_up)
     red, green, blue = model.background.tolist()
     focus = focus_of(cameras, turn)
     is_capture = model.scene.unbounded and (dataset is not None or model.scene.camera_to_worlds is not None)

@@ -85,4 +85,5 @@ class Octree:
             moving=False,
             image_size=self.image_size,
             unbounded=self.layout.coarser is not None,
+            z_is_up=True,
         )

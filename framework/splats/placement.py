@@ -73,6 +73,7 @@ def placed_gaussians(gaussians: Gaussians, up: Tensor = UP) -> tuple[Placement, 
         moving=False,
         image_size=IMAGE_SIZE,
         unbounded=not bounded,
+        z_is_up=True,
         poses="exact",
     )
     return placement, scene

@@ -159,7 +159,8 @@ class Page:
                 position, center, up = poses[0, :, 3], poses[0, :, 3] - poses[0, :, 2], poses[0, :, 1]
         else:
             pose, mean = poses[0].cpu(), poses[:, :, 1].mean(0).cpu()
-            up = torch.tensor([0.0, 0.0, 1.0]) if float(mean[2]) > 0.5 * float(mean.norm()) else mean
+            level = scene.z_is_up or float(mean[2]) > 0.5 * float(mean.norm())
+            up = torch.tensor([0.0, 0.0, 1.0]) if level else mean
             seen = looked_at(poses) if scene.unbounded else None  # a capture orbits the point that its cameras look at
             middle = (scene.box.mean(0).cpu() if seen is None else seen.float()) - pose[:, 3]
             distance = max(float(-(middle @ pose[:, 2])), 0.1 * float(middle.norm()), 1e-3)

@@ -348,7 +348,7 @@ def test_the_up_direction_that_a_file_states(capture: Path, stated: Any) -> None
     of_the_flag = Nerfstudio(orientation_method="pca").parse(capture, "train")
     assert torch.equal(left_to_the_file.transform, expected)  # type: ignore[arg-type]
     assert torch.equal(of_the_flag.transform, asked)  # type: ignore[arg-type]
-    assert load_dataset(left_to_the_file, "train").z_is_up
+    assert load_dataset(left_to_the_file, "train").scene.z_is_up
     assert not of_the_flag.z_is_up
 
 

@@ -300,7 +300,12 @@ class SourceViewsConfig(RayConfig):
 
 
 def in_all_bases(kind: type, name: str) -> dict[str, Any]:
-    """Return the dictionaries called `name` of a class and of its bases as one. A class overrides its bases."""
+    """Return the dictionaries of one name in a class and its bases as one. A class overrides its bases.
+
+    Args:
+        kind: the class.
+        name: name of the attributes, such as RANGES.
+    """
     merged: dict[str, Any] = {}
     for base in reversed(kind.__mro__):
         merged |= vars(base).get(name, {})

@@ -80,7 +80,6 @@ def export_page(loaded: Loaded, path: Path, settings: WebSettings, regions: Sequ
     start = start_of([names[index] for index in order], settings.start_view)
     ranks = shown_cameras(len(order), start)
     chosen = torch.tensor([order[rank] for rank in ranks])
-    cameras = held_upright(cameras) if model.scene.z_is_up else cameras
     turn = upright(cameras, model.scene.z_is_up)
     red, green, blue = model.background.tolist()
     focus = focus_of(cameras, turn)
@@ -150,11 +149,13 @@ def _check(settings: WebSettings, kind: str, model: Renderable, regions: Sequenc
 
 
 def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[str]]:
-    """Return the cameras of a page and their names: of the photographs, or of a scene without."""
+    """Return the cameras of a page and their names: of the photographs, or of a scene without. They are held upright."""
     if dataset is None:
         cameras = outlooks(model.scene)
-        return cameras, [f"view {number + 1}" for number in range(len(cameras))]
-    return pinhole(dataset.cameras), list(dataset.names)
+        names = [f"view {number + 1}" for number in range(len(cameras))]
+    else:
+        cameras, names = pinhole(dataset.cameras), list(dataset.names)
+    return held_upright(cameras) if model.scene.z_is_up else cameras, names
 
 
 def start_of(names: Sequence[str], wanted: str | None) -> int:

@@ -40,7 +40,11 @@ class Plane(NamedTuple):
 
 
 def size_of(points: Tensor) -> float:
-    """Return the diagonal of the box between the 5th and the 95th percentile of points (N, 3) along each axis."""
+    """Return the diagonal of the box between the 5th and the 95th percentile along each axis.
+
+    Args:
+        points: (N, 3).
+    """
     ordered = points.double().sort(0).values
     last = len(points) - 1
     return float((ordered[last - round(0.05 * last)] - ordered[round(0.05 * last)]).norm())

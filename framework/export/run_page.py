@@ -149,7 +149,7 @@ def _check(settings: WebSettings, kind: str, model: Renderable, regions: Sequenc
 
 
 def _cameras(model: Renderable, dataset: Dataset | None) -> tuple[Cameras, list[str]]:
-    """Return the cameras of a page and their names: of the photographs, or of a scene without. They are held upright."""
+    """Return the cameras of a page, held upright, and their names: of the photographs, or of a scene without."""
     if dataset is None:
         cameras = outlooks(model.scene)
         names = [f"view {number + 1}" for number in range(len(cameras))]

@@ -74,7 +74,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
     except OSError as error:
         raise ConfigError(f"{where} cannot be read: {error.strerror or error}") from error
     except zipfile.BadZipFile as error:
-        raise ConfigError(f"{where} is not a .npz file of LPIPS's weights (docs/commands.md)") from error
+        raise ConfigError(f"{where} is not a .npz file of LPIPS's weights (docs/guides/evaluation.md)") from error
     except Exception as error:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, zlib.error and more
         raise ConfigError(f"{where} is damaged: {str(error) or type(error).__name__}") from error
 
@@ -153,7 +153,7 @@ def load_lpips(weights: Path | None, device: torch.device) -> tuple[Lpips | None
 
 def _of_package(device: torch.device) -> tuple[Lpips | None, str]:
     """Load LPIPS from the `lpips` package, if the extra and AlexNet's weights are installed."""
-    advice = "pass a weights file with --lpips-weights (docs/commands.md)"
+    advice = "pass a weights file with --lpips-weights (docs/guides/evaluation.md)"
     if (command := install_command("lpips")) is not None:
         return None, f"absent: {advice}, or {command}, and torchvision's AlexNet"
     folder = Path(torch.hub.get_dir()) / "checkpoints"

@@ -101,7 +101,7 @@ def test_lpips_that_is_absent_is_null_with_a_reason(finished: Path, monkeypatch:
     monkeypatch.setattr("nerfloom.base.extras.find_spec", lambda name: None)
     found = evaluate(monkeypatch, finished, "--max-images", 1)
     assert (found["results"]["lpips"], found["results"]["lpips_std"]) == (None, None)
-    advice = "absent: pass a weights file with --lpips-weights (docs/commands.md), or pip install lpips torchvision, "
+    advice = "absent: pass a weights file with --lpips-weights (docs/guides/evaluation.md), or pip install lpips "
     assert found["lpips"].startswith(advice)
 
 

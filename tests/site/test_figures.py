@@ -141,7 +141,7 @@ def test_versions_are_those_that_ran() -> None:
 
 
 def test_flags_of_nerfstudio_are_those_that_are_answered() -> None:
-    table = {row[0].strip("`"): row[1].strip("`") for row in rows(DOCS / "from-nerfstudio.md") if len(row) == 2}
+    table = {row[0].strip("`"): row[1].strip("`") for row in rows(DOCS / "from-nerfstudio-names.md") if len(row) == 2}
     assert from_nerfstudio.SETTINGS.items() <= table.items()
     text = (DOCS / "from-nerfstudio.md").read_text()
     assert [name for name in from_nerfstudio.NO_FORMATS if f"`{name}`" not in text] == []
@@ -149,7 +149,7 @@ def test_flags_of_nerfstudio_are_those_that_are_answered() -> None:
 
 def test_methods_of_nerfstudio_are_those_that_are_answered() -> None:
     """A method in the left column has the name of one here, or is answered when somebody asks for it."""
-    table = [row for row in rows(DOCS / "from-nerfstudio.md") if len(row) == 2 and "--" not in row[1]]
+    table = [row for row in rows(DOCS / "from-nerfstudio-names.md") if len(row) == 2 and "--" not in row[1]]
     named = {name for row in table for name in re.findall(r"`([\w-]+)`", row[0])}
     assert len(named) > 20
     assert sorted(named - set(ELSEWHERE) - set(registered("methods"))) == []

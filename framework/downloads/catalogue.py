@@ -189,4 +189,4 @@ DATASETS: dict[str, Dataset] = {
         (_TANKS_AND_TEMPLES,),
     ),
 }
-"""Data sets by name. docs/data-sources.md says where addresses and sums are from."""
+"""Data sets by name. docs/notes/data_sources.md says where addresses and sums are from."""

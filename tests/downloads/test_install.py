@@ -180,7 +180,7 @@ def test_mistakes_are_one_line(words: list[str], answer: str, refused: Refused) 
 
 
 def test_the_table_of_sources_is_the_catalogue() -> None:
-    """docs/data-sources.md lists every address, marked where it was never tried, with its sum and licence."""
+    """docs/notes/data_sources.md lists every address, marked where it was never tried, with its sum and licence."""
     lines = ["| data set | archive | size | source | SHA-256 | tried |", "|---|---|---|---|---|---|"]
     for name, dataset in DATASETS.items():
         for archive in dataset.archives:
@@ -188,7 +188,7 @@ def test_the_table_of_sources_is_the_catalogue() -> None:
             for source in archive.sources:
                 stated = (source.sha256 or "none stated", source.tried or "no")
                 lines.append("| " + " | ".join((name, archive.name, size, f"<{source.url}>", *stated)) + " |")
-    text = (ROOT / "docs" / "data-sources.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "notes" / "data_sources.md").read_text(encoding="utf-8")
     assert "\n".join(lines) in text
 
 

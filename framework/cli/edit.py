@@ -31,7 +31,7 @@ class EditFlags(RegionFlags, OpenFlags):
     output_path: Path
     """File to write, .ply, .spz, .sog or .glb."""
     recipe: Path | None = None
-    """YAML file of steps with their settings (docs/guides/edit.md)."""
+    """YAML file of steps with their settings (docs/guides/recipes.md)."""
     min_opacity: float | None = None
     """Remove Gaussians of lower opacity, 0 to 1."""
     max_size: float | None = None

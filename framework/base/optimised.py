@@ -11,7 +11,7 @@ from nerfloom.base.protocols import SeesRegistered
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-Schedule = Literal["constant", "exponential", "cosine", "hold-exponential"]
+Schedule = Literal["constant", "exponential", "cosine", "hold-exponential", "fall-late"]
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,14 @@ GRADIENT = 8e-4
 units."""
 MAX_CLONED_SIZE = 0.01
 """Largest standard deviation, in scene extents, of a Gaussian that is cloned; a larger one is split."""
-MAX_DEAD_OPACITY = 0.005
-"""Gaussians at or below this opacity are dropped."""
+MAX_DEAD_OPACITY = 0.02
+"""Gaussians at or below this opacity are dropped. 3DGS has a quarter of it: such Gaussians take as much of each step as
+others, for hardly any light."""
 CHILDREN, SHRUNK = 2, 1.6
 """Number of Gaussians that replace a split one, and the divisor of its standard deviations."""
-MAX_RESET_OPACITY = 0.01
-"""Maximum opacity after a reset. Gaussians that no image needs stay transparent and are dropped."""
+MAX_RESET_OPACITY = 0.04
+"""Maximum opacity after a reset, twice `MAX_DEAD_OPACITY` as in 3DGS. Gaussians that no image needs stay transparent
+and are dropped."""
 
 
 class GradientMean(nn.Module):

@@ -31,6 +31,11 @@ CLOSED_FIELD_STEPS, MAX_CLOSED_FIELD_STEPS = 10, 2_000
 """Steps of a field to start from, for each second of the budget, and their maximum, if every ray ends in the box. At
 first the whole box is fog there: a ray has hundreds of samples, so a step has few rays and shows little."""
 PACED_WORDS = {True: "the time is limited, not the steps", False: "they are given, or the time has no limit"}
+BLURS = {
+    True: (0.1, "images with alpha are rendered, and sharp to the pixel"),
+    False: (OURS.blur, "photographs are less sharp than their pixels"),
+}
+"""Blur of Gaussians, and its reason, with alpha and without (docs/notes/splatting.md)."""
 RESET_WORDS = {
     True: ("the run is long", "resets of opacity", "every 3,000 steps"),
     False: ("the run is too short to recover from one", "resets of opacity", "none"),
@@ -75,8 +80,9 @@ class SplattingConfig(
     """Highest degree of the spherical harmonics of colours."""
     antialiased: bool = False
     """Lower the opacity of small Gaussians to compensate for their blur (Mip-Splatting)."""
-    blur: float = OURS.blur
-    """Variance added to every Gaussian on an image, pixels^2: 0.3 in 3DGS and gsplat, 0.1 in Mip-Splatting."""
+    blur: Auto[float] = AUTO
+    """Variance added to every Gaussian on an image, pixels^2: 0.3 in 3DGS, gsplat and most viewers, 0.1 in
+    Mip-Splatting. Default: 0.1 if the images have alpha, else 0.3."""
     sort: Sort = OURS.sort
     """Sort key of Gaussians. distance: distance from the camera; turning the camera does not change it. depth: depth
     along the camera's axis, as in 3DGS, gsplat and most viewers; not of panoramas and fisheyes over 178 degrees."""
@@ -172,6 +178,7 @@ def decide_splatting(config: SplattingConfigT, scene: Scene) -> tuple[SplattingC
         Choice("steps_per_reset", 3_000 if resets else NEVER, *RESET_WORDS[resets]),
         Choice("steps_per_move", MAX_STEPS, "the paper has it so", "steps between changes of the number"),
         Choice("rate_factor", round(factor, 2), "fewer steps have to go farther", "factor of learning rates"),
+        Choice("blur", *BLURS[scene.has_alpha], "blur, pixels^2"),
     )
     return config, made + more
 

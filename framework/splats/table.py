@@ -87,11 +87,13 @@ def usual_columns(degree: int, rate: float, position_rate: float) -> dict[str, C
     Args:
         degree: highest degree of the harmonics.
         rate: learning rate of scales; the others have a fixed ratio to it.
-        position_rate: learning rate of centres, extents of the scene. Only this rate follows the run's schedule.
+        position_rate: learning rate of centres, extents of the scene. Only this rate follows the run's schedule; the
+            others fall to the same share of themselves in the last 15 % of the budget. Each step shows one image, and
+            small steps at the end average over several.
     """
 
     def column(shape: tuple[int, ...], name: str, factor: float) -> Column:
-        return Column(shape, Optimised(name, factor * rate, schedule="constant", sparse=True))
+        return Column(shape, Optimised(name, factor * rate, schedule="fall-late", sparse=True))
 
     return {
         "means": Column((3,), Optimised("means", position_rate, sparse=True), in_extents=True),

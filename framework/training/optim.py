@@ -19,6 +19,9 @@ from nerfloom.kernels.table_memory import IN_MEMORY, Tables, require
 from nerfloom.model import Model
 from nerfloom.renderable import parts
 
+LATE = 0.85
+"""Share of the budget before the learning rate falls with the schedule "fall-late"."""
+
 
 class Adam:
     """Adam (Kingma and Ba 2015), with a sparse variant for groups with `sparse` set.
@@ -294,6 +297,8 @@ def _decay(schedule: str, final: float, progress: float) -> float:
         return float(final**progress)
     if schedule == "hold-exponential":
         return float(final ** max(0.0, 2 * progress - 1))
+    if schedule == "fall-late":
+        return float(final ** max(0.0, (progress - LATE) / (1 - LATE)))
     return final + (1 - final) * 0.5 * (1 + float(torch.tensor(progress * torch.pi).cos()))
 
 

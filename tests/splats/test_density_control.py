@@ -91,6 +91,13 @@ def test_transparent_ones_and_those_that_are_not_finite_are_dropped() -> None:
     assert len(change.fresh) == 0
 
 
+def test_a_reset_drops_nothing_by_itself() -> None:
+    """What is transparent after a reset has some steps to become opaque again."""
+    given = row(3)
+    given = dataclasses.replace(given, logits=DensityControl(20).reset(given, 39)["logits"])
+    assert grown(given, torch.zeros(3), 3, EXTENT) is None
+
+
 @pytest.mark.parametrize(
     ("asked", "reset"),
     [([9, 19, 29, 39, 49, 59], [19, 39, 59]), ([7, 18, 26, 37, 48], [26, 48]), ([29, 39, 49], [39])],

@@ -30,6 +30,13 @@ def test_holding_schedule_falls_in_the_second_half() -> None:
     assert learning_rate_factor(config, 0, 0.75) == pytest.approx(0.1)
 
 
+def test_a_group_may_fall_in_the_last_part_alone() -> None:
+    """It has its full rate for 85 % of the budget, and half of the fall in half of the rest."""
+    config = TrainConfig(lr_final=0.01)
+    found = [learning_rate_factor(config, 0, progress, "fall-late") for progress in (0.0, 0.5, 0.85, 0.925, 1.0)]
+    assert found == pytest.approx([1.0, 1.0, 1.0, 0.1, 0.01])
+
+
 def test_warm_up_is_linear() -> None:
     config = TrainConfig(lr_schedule="constant", lr_warmup_steps=4)
     assert [learning_rate_factor(config, step, 0.0) for step in (0, 1, 3, 9)] == [0.25, 0.5, 1.0, 1.0]

@@ -14,7 +14,7 @@ from typing import ClassVar, Literal
 
 from torch import Tensor
 
-from nerfloom import Decision, Method, Picture, Sampler, Scene, View
+from nerfloom import Decision, Method, Picture, Rays, Rendered, Sampler, Scene, View
 from nerfloom.base.config import AT_LEAST_0, Range, VectorConfig
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
@@ -27,7 +27,7 @@ from nerfloom.losses.functions import doubted_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import CaptureConfig, RefinedModel, decide_capture
-from nerfloom.rendering.transient import UNCERTAINTY, TransientRenderer
+from nerfloom.rendering.transient import STATIC, UNCERTAINTY, TransientRenderer
 from nerfloom.rendering.volume import scaled_up_to
 from nerfloom.samplers.choice import decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge
@@ -105,6 +105,14 @@ class NerfW(RefinedModel[NerfWConfig], plain=True):
 
     losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion())
     renderer: TransientRenderer
+
+    def lit(self, rendered: Rendered, rays: Rays, background: Tensor) -> Rendered:
+        if self.light is None:
+            return rendered
+        static = super().lit(replace(rendered, rgb=rendered.extras[STATIC.name]), rays, background)
+        both = super().lit(replace(rendered, accumulation=rendered.extras["opacity"]), rays, background)
+        extras = {**both.extras, STATIC.name: static.rgb}
+        return replace(both, accumulation=rendered.accumulation, extras=extras)
 
     def render_view(self, view: View, background: Tensor) -> Picture:
         if view.image is None:

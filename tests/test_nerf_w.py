@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerfloom import Field, Points, Rays, Samples
+from nerfloom import Field, Points, Rays, Sampler, Samples
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
 from nerfloom.losses.functions import doubted_error
@@ -114,6 +114,47 @@ def test_two_parts_are_composited_as_many_thin_slices() -> None:
         torch.testing.assert_close(found.extras["static"][ray], static + alone * background, atol=1e-12, rtol=0)
         mean = density[5 * ray : 5 * ray + 5].mean()
         torch.testing.assert_close(found.extras["transient_density"][ray], mean)
+
+
+class Placed(Sampler):
+    """Given samples."""
+
+    def __init__(self, samples: Samples) -> None:
+        super().__init__()
+        self.samples = samples
+
+    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
+        return self.samples
+
+
+def test_the_light_of_an_image_changes_both_parts_and_not_the_background() -> None:
+    """Against colours that are changed at each sample, before they are composited."""
+    rays, samples, field, head = two_parts()
+    scene, behind = ball_in_a_box().scene, torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+    config = nerf_w.METHOD.decided(dataclasses.replace(nerf_w.METHOD.config, appearance="affine"), scene)[0]
+    renderer = TransientRenderer(head, LEAST, None)
+    model = nerf_w.NerfW(config, scene, field, Placed(samples), renderer).double().eval()
+    assert model.light is not None
+    with torch.no_grad():
+        model.light.vectors.copy_(0.3 * torch.randn(model.light.vectors.shape))
+    assert rays.camera_indices is not None
+    images = rays.camera_indices[samples.ray_indices]
+    for indices, rows in ((rays.camera_indices, images), (None, None)):
+        parameters = model.light.vectors if rows is not None else model.light.vectors.mean(0)
+        affine = (parameters if rows is None else parameters[rows]).detach().view(-1, 3, 4)
+
+        def changed(colors: Tensor, by: Tensor = affine) -> Tensor:
+            return colors + (by[..., :3] * colors[:, None]).sum(-1) + by[..., 3]
+
+        seen = dataclasses.replace(rays, camera_indices=indices)
+        lit = Given(head.given[0], changed(head.given[1]), head.given[2])
+        expected = TransientRenderer(lit, LEAST, None).render(
+            seen, samples, Slabs(field.sigma, changed(field.rgb)), behind
+        )
+        found = model.render(seen, behind)
+        torch.testing.assert_close(found.rgb, expected.rgb)
+        torch.testing.assert_close(found.extras["static"], expected.extras["static"])
+        torch.testing.assert_close(found.accumulation, expected.accumulation)
 
 
 def test_rays_of_no_training_image_show_the_static_part() -> None:

@@ -1,6 +1,7 @@
 """NeRF-W: its loss, compositing of two parts, held-out views, and transient vectors."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from nerfloom import Field, Points, Rays, Sampler, Samples
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
 from nerfloom.losses.functions import doubted_error
+from nerfloom.losses.term import RenderedBatch
 from nerfloom.methods import nerf_w
 from nerfloom.methods.nerf_w import START
 from nerfloom.rendering.transient import TransientRenderer
@@ -196,7 +198,7 @@ def test_each_image_has_its_own_vector() -> None:
     assert found.tolist() == [[4, 5], [0, 1], [2, 3], [4, 5]]
 
 
-@pytest.mark.parametrize(("encoding", "rate"), [("frequency", 5e-4), ("hash-grid", 1e-2)])
+@pytest.mark.parametrize(("encoding", "rate"), [("frequency", 5e-4), ("hash-grid", 1e-2), ("planes", 1e-2)])
 def test_field_and_transient_head_learn_at_the_same_rate(encoding: str, rate: float) -> None:
     """The paper's, 5e-4, for the paper's networks."""
     scene, small = ball_in_a_box().scene, {"log2_table_size": 12, "grid_resolution": 16}
@@ -217,6 +219,29 @@ def test_the_paper_network_contracts_space_if_asked(unbounded: bool, contraction
     assert (field.contracted is not None) == contraction
 
 
+def test_planes_have_a_vertex_for_each_pixel_and_their_variation_counts() -> None:
+    """The variation in float64 over all rows; a step reads a random band of them."""
+    scene, settings = (
+        dataclasses.replace(ball_in_a_box().scene, image_size=100),
+        {**TINY["nerf-w"], "encoding": "planes"},
+    )
+    config = nerf_w.METHOD.decided(dataclasses.replace(nerf_w.METHOD.config, **settings), scene)[0]
+    model: Any = nerf_w.METHOD.build(config, scene)
+    planes = model.field.encoding
+    assert planes.resolutions.tolist() == [[64] * 3, [128] * 3]
+    factors = [planes.layout.factor(planes.table.detach().double(), *factor) for factor in planes.all_factors]
+    steps = [x.diff(dim=axis).square().mean() for x in factors for axis in (0, 1)]
+    expected = torch.stack(steps).sum() / (2 * len(factors))
+    batch = RenderedBatch(batch=None, rendered=None, model=model, step=0)  # type: ignore[arg-type]
+    torch.manual_seed(0)
+    found = torch.stack([nerf_w.PlaneVariation()(batch).detach() for _ in range(50)]).mean()
+    assert float(found) == pytest.approx(float(expected), rel=0.05)  # a band of one row has no steps
+    assert nerf_w.PlaneVariation().applies(batch.batch, model)
+    model.config = dataclasses.replace(config, encoding="hash-grid")
+    assert not nerf_w.PlaneVariation().applies(batch.batch, model)
+
+
 @pytest.mark.slow
-def test_the_papers_networks_pass() -> None:
-    assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **TINY["nerf-w+frequency"]))
+@pytest.mark.parametrize("settings", [TINY["nerf-w+frequency"], {**TINY["nerf-w"], "encoding": "planes"}])
+def test_other_encodings_pass(settings: dict[str, Any]) -> None:
+    assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **settings))

@@ -66,17 +66,25 @@ class RayModel(PixelModel[RayConfigT]):
         """
         rays = rays if self.covisible_space is None else self.covisible_space(rays)
         samples = self.sampler.sample(rays, self.field, self.training)
-        return self._lit(self.renderer.render(rays, samples, self.field, background), rays, background)
+        return self.lit(self.renderer.render(rays, samples, self.field, background), rays, background)
 
-    def _lit(self, rendered: Rendered, rays: Rays, background: Tensor) -> Rendered:
-        """Return rendered values with the colours that the rays' images show (`light`)."""
+    def lit(self, rendered: Rendered, rays: Rays, background: Tensor) -> Rendered:
+        """Return rendered values with the colours that the rays' images show (`light`).
+
+        A model that renders further colours may override it.
+
+        Args:
+            rendered: R rays with the colours of the scene.
+            rays: the rays; their images have the light.
+            background: (R, 3) or (3,) colour in [0, 1] of the background, which keeps its colour.
+        """
         if self.light is None:
             return rendered
         rgb = self.light.lit(rendered.rgb, rendered.accumulation, background, rays.camera_indices, rays.places)
         lit = replace(rendered, rgb=rgb)
         if rendered.coarse is None:
             return lit
-        return replace(lit, extras={**lit.extras, "coarse": self._lit(rendered.coarse, rays, background)})
+        return replace(lit, extras={**lit.extras, "coarse": self.lit(rendered.coarse, rays, background)})
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
         """Return the terms of `losses` on a batch.
@@ -160,7 +168,7 @@ class RayModel(PixelModel[RayConfigT]):
         known = None
         if self._renders_plainly and self.covisible_space is None:
             known = traced_rays(rays, background, self.sampler, self.field, self.renderer)
-        return self.render(rays, background) if known is None else self._lit(known, rays, background)
+        return self.render(rays, background) if known is None else self.lit(known, rays, background)
 
     def _seen(self, view: View) -> Tensor | None:
         """Return the pixels of a view that may show more than the background; None if unknown."""

@@ -15,7 +15,7 @@ from nerfloom import Decision, LearnsMotion, Method, Points, RayModel, Scene
 from nerfloom.base import device as devices
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
 from nerfloom.base.decisions import Choice, fill
-from nerfloom.encodings.planes import FeaturePlanes
+from nerfloom.encodings.planes import FeaturePlanes, resolutions_of, scales_for
 from nerfloom.fields.base import MLP
 from nerfloom.fields.encoded import BoxField, EncodedField
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
@@ -172,9 +172,7 @@ class KPlanes(RayModel[KPlanesConfig], LearnsMotion, plain=True):
 
 def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Decision]]:
     """Fill in the settings that depend on the scene."""
-    scales = 1  # grows until a plane has at least a vertex per pixel
-    while scales < MAX_SCALES and config.base_resolution << (scales - 1) < scene.image_size:
-        scales += 1
+    scales = scales_for(scene.image_size, config.base_resolution, MAX_SCALES)
     config, made = fill(
         config,
         sampler_choice(config, scene.unbounded),
@@ -205,12 +203,7 @@ def decide(config: KPlanesConfig, scene: Scene) -> tuple[KPlanesConfig, list[Dec
 def make_field(config: KPlanesConfig, scene: Scene) -> BoxField:
     """Return a field on feature planes, with the configured decoder."""
     time = (config.time_resolution,) if scene.moving else ()
-    size = scene.box[1] - scene.box[0]
-    edges = size / size.max()  # vertices are equally far apart along x, y and z
-    resolutions = tuple(
-        tuple(max(round((config.base_resolution << scale) * edge), 2) for edge in edges.tolist()) + time
-        for scale in range(config.num_scales)
-    )
+    resolutions = resolutions_of(scene.box, config.base_resolution, config.num_scales, time)
     sparse, opening = config.sparse_updates, config.open_levels_until
     planes = FeaturePlanes(resolutions, config.features_per_scale, sparse=sparse, opening=opening)
     kind = EncodedField if config.decoder == "hybrid" else ExplicitField

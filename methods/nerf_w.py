@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, cast
 
 from torch import Tensor
 
-from nerfloom import Decision, Method, Picture, Sampler, Scene, View
+from nerfloom import Decision, Method, Picture, PixelBatch, RayModel, Rays, Rendered, Sampler, Scene, View
 from nerfloom.base.config import AT_LEAST_0, Range, VectorConfig
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.planes import FeaturePlanes, resolutions_of, scales_for
 from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.nerf import NeRFField
@@ -27,13 +28,18 @@ from nerfloom.losses.functions import doubted_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import CaptureConfig, RefinedModel, decide_capture
-from nerfloom.rendering.transient import UNCERTAINTY, TransientRenderer
+from nerfloom.rendering.transient import STATIC, UNCERTAINTY, TransientRenderer
 from nerfloom.rendering.volume import scaled_up_to
 from nerfloom.samplers.choice import decide_samples, make_sampler
 from nerfloom.samplers.proposal import half_edge
 
 PAPER_WIDTH, GRID_WIDTH = 256, 64
 """Features per hidden layer: the paper's networks, with half as many in their heads, and networks on a hash grid."""
+PLANES, PLANE_FEATURES, MAX_SCALES = 64, 32, 4
+"""Vertices along an axis at the coarsest scale of planes, features of a vertex, and the maximum number of scales: those
+of K-Planes (Fridovich-Keil et al. 2023) for Photo Tourism."""
+PLANE_VARIATION = 1e-4
+"""Weight of the total variation of planes, as in kplanes."""
 PAPER_RATE = 0.05
 """Learning rate of the paper's networks, relative to a hash grid's: 5e-4 by default."""
 START = 0.05
@@ -66,8 +72,9 @@ class NerfWConfig(
         "transient_density_mult": AT_LEAST_0,
     }
     """Allowed range of each numeric setting."""
-    encoding: Literal["hash-grid", "frequency"] = "hash-grid"
-    """hash-grid: small networks on a hash grid. frequency: the paper's networks, of 8 layers of 256 features."""
+    encoding: Literal["hash-grid", "planes", "frequency"] = "hash-grid"
+    """hash-grid: small networks on a hash grid. planes: the same on the feature planes of K-Planes. frequency: the
+    paper's networks, of 8 layers of 256 features."""
     transient_embedding_dim: int = 16
     """Length of an image's transient vector."""
     least_uncertainty: float = 0.1
@@ -100,11 +107,33 @@ class TransientDensity(LossTerm):
         return None if density is None or not len(density) else unit * density.mean()
 
 
+class PlaneVariation(LossTerm):
+    """Total variation of feature planes: K-Planes, equation 4; from a random band of rows of each, without bias."""
+
+    def __init__(self) -> None:
+        super().__init__("planes", PLANE_VARIATION)
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return bool(model.config.encoding == "planes")
+
+    def __call__(self, shown: RenderedBatch) -> Tensor:
+        planes = cast("FeaturePlanes", cast("EncodedField", shown.model.field).encoding)
+        return planes.variation(planes.all_factors).sum() / (2 * len(planes.all_factors))
+
+
 class NerfW(RefinedModel[NerfWConfig], plain=True):
     """A model that gives less weight to an image where the others disagree with it."""
 
-    losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion())
+    losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion(), PlaneVariation())
     renderer: TransientRenderer
+
+    def lit(self, rendered: Rendered, rays: Rays, background: Tensor) -> Rendered:
+        if self.light is None:
+            return rendered
+        static = super().lit(replace(rendered, rgb=rendered.extras[STATIC.name]), rays, background)
+        both = super().lit(replace(rendered, accumulation=rendered.extras["opacity"]), rays, background)
+        extras = {**both.extras, STATIC.name: static.rgb}
+        return replace(both, accumulation=rendered.accumulation, extras=extras)
 
     def render_view(self, view: View, background: Tensor) -> Picture:
         if view.image is None:
@@ -130,9 +159,14 @@ def make_field(config: NerfWConfig, scene: Scene) -> EncodedField | NeRFField:
         field = NeRFField(PAPER_WIDTH, contracted=scene.box if config.contraction else None, appearance=appearance)
         field.optimised = _optimised(config)
         return field
-    return EncodedField(
-        scene.box, HashGrid.of(config, 0.0), GRID_WIDTH, unbounded=config.contraction, appearance=appearance
-    )
+    encoding = _planes(scene) if config.encoding == "planes" else HashGrid.of(config, 0.0)
+    return EncodedField(scene.box, encoding, GRID_WIDTH, unbounded=config.contraction, appearance=appearance)
+
+
+def _planes(scene: Scene) -> FeaturePlanes:
+    """Return feature planes that suit a scene."""
+    resolutions = resolutions_of(scene.box, PLANES, scales_for(scene.image_size, PLANES, MAX_SCALES))
+    return FeaturePlanes(resolutions, PLANE_FEATURES, sparse=True)
 
 
 def sampler(config: NerfWConfig, scene: Scene) -> Sampler:

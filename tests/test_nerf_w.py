@@ -1,15 +1,17 @@
 """NeRF-W: its loss, compositing of two parts, held-out views, and transient vectors."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from nerfloom import Field, Points, Rays, Samples
+from nerfloom import Field, Points, Rays, Sampler, Samples
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
 from nerfloom.losses.functions import doubted_error
+from nerfloom.losses.term import RenderedBatch
 from nerfloom.methods import nerf_w
 from nerfloom.methods.nerf_w import START
 from nerfloom.rendering.transient import TransientRenderer
@@ -116,6 +118,47 @@ def test_two_parts_are_composited_as_many_thin_slices() -> None:
         torch.testing.assert_close(found.extras["transient_density"][ray], mean)
 
 
+class Placed(Sampler):
+    """Given samples."""
+
+    def __init__(self, samples: Samples) -> None:
+        super().__init__()
+        self.samples = samples
+
+    def sample(self, rays: Rays, field: Field, jitter: bool) -> Samples:
+        return self.samples
+
+
+def test_the_light_of_an_image_changes_both_parts_and_not_the_background() -> None:
+    """Against colours that are changed at each sample, before they are composited."""
+    rays, samples, field, head = two_parts()
+    scene, behind = ball_in_a_box().scene, torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)
+    config = nerf_w.METHOD.decided(dataclasses.replace(nerf_w.METHOD.config, appearance="affine"), scene)[0]
+    renderer = TransientRenderer(head, LEAST, None)
+    model = nerf_w.NerfW(config, scene, field, Placed(samples), renderer).double().eval()
+    assert model.light is not None
+    with torch.no_grad():
+        model.light.vectors.copy_(0.3 * torch.randn(model.light.vectors.shape))
+    assert rays.camera_indices is not None
+    images = rays.camera_indices[samples.ray_indices]
+    for indices, rows in ((rays.camera_indices, images), (None, None)):
+        parameters = model.light.vectors if rows is not None else model.light.vectors.mean(0)
+        affine = (parameters if rows is None else parameters[rows]).detach().view(-1, 3, 4)
+
+        def changed(colors: Tensor, by: Tensor = affine) -> Tensor:
+            return colors + (by[..., :3] * colors[:, None]).sum(-1) + by[..., 3]
+
+        seen = dataclasses.replace(rays, camera_indices=indices)
+        lit = Given(head.given[0], changed(head.given[1]), head.given[2])
+        expected = TransientRenderer(lit, LEAST, None).render(
+            seen, samples, Slabs(field.sigma, changed(field.rgb)), behind
+        )
+        found = model.render(seen, behind)
+        torch.testing.assert_close(found.rgb, expected.rgb)
+        torch.testing.assert_close(found.extras["static"], expected.extras["static"])
+        torch.testing.assert_close(found.accumulation, expected.accumulation)
+
+
 def test_rays_of_no_training_image_show_the_static_part() -> None:
     rays, samples, field, head = two_parts()
     renderer, background = TransientRenderer(head, LEAST, None), torch.zeros(3, dtype=torch.float64)
@@ -155,7 +198,7 @@ def test_each_image_has_its_own_vector() -> None:
     assert found.tolist() == [[4, 5], [0, 1], [2, 3], [4, 5]]
 
 
-@pytest.mark.parametrize(("encoding", "rate"), [("frequency", 5e-4), ("hash-grid", 1e-2)])
+@pytest.mark.parametrize(("encoding", "rate"), [("frequency", 5e-4), ("hash-grid", 1e-2), ("planes", 1e-2)])
 def test_field_and_transient_head_learn_at_the_same_rate(encoding: str, rate: float) -> None:
     """The paper's, 5e-4, for the paper's networks."""
     scene, small = ball_in_a_box().scene, {"log2_table_size": 12, "grid_resolution": 16}
@@ -176,6 +219,29 @@ def test_the_paper_network_contracts_space_if_asked(unbounded: bool, contraction
     assert (field.contracted is not None) == contraction
 
 
+def test_planes_have_a_vertex_for_each_pixel_and_their_variation_counts() -> None:
+    """The variation in float64 over all rows; a step reads a random band of them."""
+    scene, settings = (
+        dataclasses.replace(ball_in_a_box().scene, image_size=100),
+        {**TINY["nerf-w"], "encoding": "planes"},
+    )
+    config = nerf_w.METHOD.decided(dataclasses.replace(nerf_w.METHOD.config, **settings), scene)[0]
+    model: Any = nerf_w.METHOD.build(config, scene)
+    planes = model.field.encoding
+    assert planes.resolutions.tolist() == [[64] * 3, [128] * 3]
+    factors = [planes.layout.factor(planes.table.detach().double(), *factor) for factor in planes.all_factors]
+    steps = [x.diff(dim=axis).square().mean() for x in factors for axis in (0, 1)]
+    expected = torch.stack(steps).sum() / (2 * len(factors))
+    batch = RenderedBatch(batch=None, rendered=None, model=model, step=0)  # type: ignore[arg-type]
+    torch.manual_seed(0)
+    found = torch.stack([nerf_w.PlaneVariation()(batch).detach() for _ in range(50)]).mean()
+    assert float(found) == pytest.approx(float(expected), rel=0.05)  # a band of one row has no steps
+    assert nerf_w.PlaneVariation().applies(batch.batch, model)
+    model.config = dataclasses.replace(config, encoding="hash-grid")
+    assert not nerf_w.PlaneVariation().applies(batch.batch, model)
+
+
 @pytest.mark.slow
-def test_the_papers_networks_pass() -> None:
-    assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **TINY["nerf-w+frequency"]))
+@pytest.mark.parametrize("settings", [TINY["nerf-w+frequency"], {**TINY["nerf-w"], "encoding": "planes"}])
+def test_other_encodings_pass(settings: dict[str, Any]) -> None:
+    assert_method(nerf_w.METHOD, "nerf-w", dataclasses.replace(nerf_w.METHOD.config, **settings))

@@ -21,6 +21,34 @@ BANDS = 16
 """`FeaturePlanes.bands` divides the rows of a factor into this many bands."""
 
 
+def scales_for(image_size: int, base: int, most: int) -> int:
+    """Return the number of scales until the finest has a vertex per image pixel, at most `most`.
+
+    Args:
+        image_size: pixels along the images' longer side.
+        base: vertices per axis at the coarsest scale; each further scale has twice as many.
+        most: maximum number of scales.
+    """
+    scales = 1
+    while scales < most and base << (scales - 1) < image_size:
+        scales += 1
+    return scales
+
+
+def resolutions_of(box: Tensor, base: int, num_scales: int, time: tuple[int, ...] = ()) -> tuple[tuple[int, ...], ...]:
+    """Return the vertices along each axis at each scale, equally far apart along x, y and z.
+
+    Args:
+        box: (2, 3) corners of the encoded region, scene units.
+        base: vertices along the longest axis at the coarsest scale; each further scale has twice as many.
+        num_scales: number of scales.
+        time: vertices along further axes, the same at every scale.
+    """
+    size = box[1] - box[0]
+    edges = (size / size.max()).tolist()
+    return tuple(tuple(max(round((base << scale) * edge), 2) for edge in edges) + time for scale in range(num_scales))
+
+
 class FeaturePlanes(nn.Module):
     """Factorised features over [0, 1]^D: K-Planes, section 3, and TensoRF, section 4. A fourth axis is time.
 

@@ -71,6 +71,7 @@ SETTINGS: dict[str, Any] = {
     # Pictures of a field have one light and known poses.
     "appearance": "none",
     "camera_optimizer": "off",
+    "robust": "off",
     "depth_loss_mult": 0.0,
     "field_depth_mult": 0.0,
     "background": "black",  # `FieldPictures` chooses it

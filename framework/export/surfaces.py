@@ -46,7 +46,7 @@ def found_surfaces(
         method: the method of the field, which casts rays: instant-ngp, or nerfacto where there may be something outside
             the scene's box, which instant-ngp does not see.
         dataset: the images.
-        config: settings of the calling run; machine and background are used.
+        config: settings of the calling run; machine, background and robust are used.
         steps: maximum number of training steps of the field.
         seconds: maximum training time of the field, seconds; infinity for no limit.
         count: maximum number of points.
@@ -62,6 +62,7 @@ def found_surfaces(
         max_seconds=limit,
         machine=config.machine,
         background=config.background,
+        robust="errors" if config.robust == "errors" else "off",  # what a scout has found is not drawn any more
     )
     trainer = Trainer(method, settings, dataset)
     for report in track(trainer.steps(), "Looking for surfaces", total=steps):

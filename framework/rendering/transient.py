@@ -26,8 +26,8 @@ class TransientRenderer(VolumeRenderer):
     In an interval where both have density, each emits light in proportion to it. This is the integral of equation 3 for
     constant densities. The paper's equation 8 adds their opacities instead, which is the same for thin intervals.
 
-    Depth, opacity and weights describe the static part. The uncertainty is composited by the transient density
-    alone (equation 11), so that it does not change the static part.
+    Depth, opacity and weights describe the static part; `extras["opacity"]` is of both parts. The uncertainty is
+    composited by the transient density alone (equation 11), so that it does not change the static part.
 
     Args:
         head: the transient part.
@@ -47,6 +47,7 @@ class TransientRenderer(VolumeRenderer):
         static = volume_render(rays, samples, sigma, rgb, background)
         extras = {STATIC.name: static.rgb, TRANSIENT.name: torch.zeros_like(static.rgb)}
         extras[UNCERTAINTY.name] = torch.full_like(static.depth, self.least)
+        extras["opacity"] = static.accumulation
         vectors = self.head.vectors_of(rays)
         if vectors is None:
             return replace(static, extras=extras)
@@ -57,6 +58,7 @@ class TransientRenderer(VolumeRenderer):
         share = (density / (sigma + density).clamp(min=torch.finfo(torch.float32).tiny))[:, None]
         both = volume_render(rays, samples, sigma + density, torch.lerp(rgb, color, share), background)
         assert both.weights is not None
+        extras["opacity"] = both.accumulation
         extras[TRANSIENT.name] = ray_sum((both.weights[:, None] * share * color).detach(), samples)
         nothing_behind, doubts = torch.zeros_like(background), doubt[:, None].expand(-1, 3)
         extras[UNCERTAINTY.name] = self.least + volume_render(rays, samples, density, doubts, nothing_behind).rgb[:, 0]

@@ -21,7 +21,7 @@ from nerfloom.base.signals import Stopped
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
 from nerfloom.data.scene import Scene
-from nerfloom.data.sources import BatchSource, Request, make_source
+from nerfloom.data.sources import BatchSource, Request
 from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.evaluation.metrics import psnr
 from nerfloom.kernels.adam.adam import all_finite
@@ -112,8 +112,8 @@ def _trained_and_evaluated(condition: Condition, run: Run, views: Views, budget:
     config = shortened(run.config, budget, method, views.train.scene)
     config = from_plain(config, condition.settings(config), condition.name)
     changed = condition.change(views).to(choose_device(config.machine))
-    source = StressedSource(make_source(method.model.batches, changed.train, config), condition)
-    trainer = Trainer(method, config, changed.train, source=source)
+    trainer = Trainer(method, config, changed.train)
+    trainer.source = StressedSource(trainer.source, condition)  # the settings are decided now, --robust too
     if (number := trainer.train().stopped_by) is not None:
         raise Stopped(number)
     state = trainer.state

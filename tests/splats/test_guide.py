@@ -16,6 +16,7 @@ from nerfloom.export.surfaces import found_surfaces
 from nerfloom.methods.gaussian_splatting import GaussianSplattingConfig, decide
 from nerfloom.registry import load_method
 from nerfloom.splats.guide import GUIDED_UNTIL, FoundDistances, guidance
+from nerfloom.testing.scenes import ball_in_a_box
 from tests.splats.test_method import SCENE, ball, camera
 from tests.splats.test_what_images_differ_in import model_of
 from tests.training.helpers import TINY, tiny_trainer
@@ -78,6 +79,22 @@ def test_what_a_field_finds_lies_on_the_rays_of_its_pixels(shared_tiny: Path, tm
     places = rays.origins + found.distances[:, None] * rays.directions
     assert torch.allclose(places, found.positions, atol=1e-4)
     assert found.motions is None
+
+
+@pytest.mark.parametrize(("robust", "expected"), [("off", "off"), ("scout", "off"), ("errors", "errors")])
+def test_the_field_has_the_rule_of_the_gaussians_and_no_scout_of_its_own(
+    robust: str, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own auto would look for people again, also with --robust off."""
+    config: Any = load_method("gaussian-splatting").config
+
+    def trainer(method: Any, settings: Any, dataset: Any) -> None:
+        assert settings.robust == expected
+        raise InterruptedError
+
+    monkeypatch.setattr("nerfloom.export.surfaces.Trainer", trainer)
+    with pytest.raises(InterruptedError):
+        found_surfaces(load_method("instant-ngp"), ball_in_a_box(8), replace(config, robust=robust), 10, 60.0, 500)
 
 
 @pytest.mark.parametrize(("end_on_a_surface", "most"), [(1, 300), (4, 1200)])

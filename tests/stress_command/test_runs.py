@@ -4,17 +4,20 @@ import json
 import math
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from nerfloom import registry
+from nerfloom import ConfigError, registry
 from nerfloom.cli.stress import main
 from nerfloom.stress.conditions import CONDITIONS, PLAIN, select
 from nerfloom.stress.scenes import ball_views
 from nerfloom.stress.trial import Budget, attempt, unsound
 from nerfloom.stress.verdict import verdicts
+from nerfloom.training.trainer import Trainer
 from tests.cli.helpers import TINY_NGP
 from tests.conftest import Refused
 from tests.training.helpers import TINY, tiny_run, tiny_trainer
@@ -64,6 +67,24 @@ def test_the_same_run_twice_is_the_same(tmp_path: Path) -> None:
     first, second = (attempt(PLAIN, run, BALL, Budget(20, None)) for _ in range(2))
     assert first.psnr == second.psnr
     assert first.error is None
+
+
+def test_batches_are_those_of_the_decided_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as --robust, which is decided from the images."""
+    known = list[bool]()
+
+    def decided(config: Any, dataset: object) -> tuple[Any, list[Any]]:
+        return replace(config, robust="errors"), []
+
+    def train(trainer: Trainer) -> None:
+        known.append(trainer.source.contradicted is not None)
+        raise ConfigError("seen")
+
+    monkeypatch.setattr("nerfloom.training.preparation.robust_chosen", decided)
+    monkeypatch.setattr(Trainer, "train", train)
+    found = attempt(PLAIN, tiny_run("instant-ngp", Path("none"), tmp_path), BALL, Budget(1, None))
+    assert found.error == "seen"
+    assert known == [True]
 
 
 def test_what_is_not_finite_is_named(shared_tiny: Path, tmp_path: Path) -> None:

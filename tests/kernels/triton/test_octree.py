@@ -91,6 +91,7 @@ def test_weights_and_peaks() -> None:
     torch.testing.assert_close(peaks, weights)
 
 
+@pytest.mark.slow
 def test_opaque_empty_and_bright_leaves() -> None:
     """Optical depths from 0 to 10,000, and colours far above 1."""
     torch.manual_seed(11)

@@ -208,9 +208,9 @@ def _viewer(flags: ViewerBenchFlags) -> None:
     from nerfloom.training.machine import machine
 
     if not flags.runs or not all(width >= 8 for width in flags.widths):
-        raise FlagError("--runs: name the folders of trained runs; --widths are at least 8 pixels")
+        raise FlagError("--runs: name trained runs or files; --widths are at least 8 pixels")
     make_room(flags.output_dir / "viewer.json")
-    rows = [measured(run, width, width, flags.pictures) for run in flags.runs for width in flags.widths]
+    rows = [measured(run, width, width, flags.pictures, flags.data) for run in flags.runs for width in flags.widths]
     for row in rows:
         say(
             f"{row.method} {row.width}x{row.height}: first {row.first:.3f} s, moving {1e3 * row.coarse:.0f} ms "

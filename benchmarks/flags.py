@@ -145,10 +145,12 @@ class MeshFlags:
 
 @dataclass(frozen=True)
 class ViewerBenchFlags:
-    """Measure the viewer's pictures of trained runs, from a request to the JPEG file, for one browser, on the CPU."""
+    """Measure the viewer's pictures of runs and files, from a request to the JPEG file, for one browser, on the CPU."""
 
     runs: tuple[Path, ...] = ()
-    """Folders of trained runs."""
+    """Run folders, scenes in blocks, and files of Gaussians, of levels or of octrees, as ns-eval takes them."""
+    data: Path | None = None
+    """Folder of the data of files, or of runs if it has moved."""
     widths: tuple[int, ...] = (400, 800)
     """Widths and heights of the finished pictures, pixels."""
     pictures: int = 60

@@ -12,11 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import numpy as np
+from torch import Tensor
 
-from nerfloom.training.trained import load_trained
+from nerfloom.data.scene import Scene
+from nerfloom.training.load import load
+from nerfloom.training.run_path import trained_run
 from nerfloom.viewer.browser import FINE_QUALITY, Browser
 from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import Pose, Request
@@ -27,10 +29,10 @@ WARM_UP = 12
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds of a viewer's pictures of one run."""
+    """Seconds of a viewer's pictures of one run or file."""
 
     run: str
-    """Name of the run's folder of experiments; by default the data's name."""
+    """Last three names of its path. Of a run: data, method and time."""
     method: str
     """Name of the method."""
     width: int
@@ -53,16 +55,21 @@ class Times:
     """Rays per pixel of the finished picture."""
 
 
-def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
-    """Measure the pictures of a trained run in one browser: the camera turns, then rests until the last is done.
+def measured(run: Path, width: int, height: int, count: int = 60, data: Path | None = None) -> Times:
+    """Measure pictures in one browser: the camera turns, then rests until the last is done.
 
     Args:
-        run: the run's folder.
+        run: the run or file, as `nerfloom.load` takes it.
         width, height: size of the browser's picture, pixels.
         count: number of pictures of the moving camera.
+        data: folder of the data: of a file, or of a run if it has moved.
+
+    Raises:
+        ConfigError, CheckpointError, DataError: if it cannot be loaded, or is a file and its data are not given.
     """
-    trained = load_trained(run, device_type="cpu")
-    queue = RenderQueue(trained)
+    loaded = load(trained_run(run, None, data), device_type="cpu", data=data)
+    scene, start = loaded.model.scene, loaded.parsed("train").cameras.camera_to_worlds[0, :, 3]
+    queue = RenderQueue(loaded)
     shown: list[tuple[float, int]] = []
 
     def show(image: np.ndarray, quality: int) -> None:
@@ -72,13 +79,13 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
     browser = Browser(show)
     queue.add(0, browser)
     begun = time.perf_counter()
-    queue.ask(0, _always(_request(trained.model.scene, 0, width, height)))
+    queue.ask(0, _always(_request(scene, start, 0, width, height)))
     queue.draw_next()
     first = shown[-1][0] - begun
     seconds = []
     for index in range(WARM_UP + count):
         begun = time.perf_counter()
-        queue.ask(0, _always(_request(trained.model.scene, index + 1, width, height)))
+        queue.ask(0, _always(_request(scene, start, index + 1, width, height)))
         queue.draw_next()
         seconds.append(shown[-1][0] - begun)
     moving = seconds[WARM_UP:]
@@ -87,8 +94,8 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
             threading.Event().wait(0.005)
     assert shown[-1][1] == FINE_QUALITY
     return Times(
-        run.resolve().parent.parent.name,
-        trained.method,
+        "/".join(loaded.origin.resolve().parts[-3:]),
+        loaded.method,
         width,
         height,
         first,
@@ -97,7 +104,7 @@ def measured(run: Path, width: int, height: int, count: int = 60) -> Times:
         browser.stride or 0,
         len(moving) / sum(moving),
         shown[-1][0] - begun,
-        trained.model.rays_per_pixel,
+        loaded.model.rays_per_pixel,
     )
 
 
@@ -111,11 +118,10 @@ def _jpeg(image: np.ndarray, quality: int) -> bytes:
     return iio.imwrite("<bytes>", image, extension=".jpeg", quality=quality)
 
 
-def _request(scene: Any, index: int, width: int, height: int) -> Request:
-    """Return a request for a camera that circles the scene at the distance of the first training camera."""
+def _request(scene: Scene, start: Tensor, index: int, width: int, height: int) -> Request:
+    """Return a request for a camera that circles the scene at the distance of a position `start` (3,)."""
     center = scene.box.mean(0).double()
-    position = scene.camera_to_worlds[0, :, 3].double() - center
-    radius, angle = float(position.norm()), 0.02 * index
+    radius, angle = float((start.double() - center).norm()), 0.02 * index
     place = (radius * 0.9 * math.cos(angle), radius * 0.9 * math.sin(angle), radius * 0.436)
     back = [value / radius for value in place]
     right = (-math.sin(angle), math.cos(angle), 0.0)

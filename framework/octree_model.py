@@ -56,6 +56,7 @@ class OctreeConfig(
 
 
 OctreeConfigT = TypeVar("OctreeConfigT", bound=OctreeConfig)
+OctreeModelT = TypeVar("OctreeModelT", bound="OctreeModel[Any]")
 
 
 class LeafTable(nn.Module):
@@ -107,6 +108,7 @@ class OctreeModel(PixelModel[OctreeConfigT], DrawsOctree):
         self.register_buffer("cells", torch.zeros(0, 3, dtype=torch.int32))
         self.register_buffer("peaks", None)
         self._layout = OctreeLayout.build(self.frame[:3], 1.0, (1, 1, 1), self.cells.long())[0]
+        self._largest: float | None = None
         self.register_load_state_dict_post_hook(lambda module, _: module.find_leaves())
 
     # -- the leaves -------------------------------------------------------------------------------------------
@@ -134,7 +136,7 @@ class OctreeModel(PixelModel[OctreeConfigT], DrawsOctree):
         Args:
             layout: where the L leaves are.
         """
-        self._layout = layout
+        self._layout, self._largest = layout, None
         self.frame = torch.cat([layout.origin, layout.origin.new_tensor([layout.cell])])
         self.bricks = torch.tensor(layout.size, device=layout.origin.device)
         self.cells = layout.cells().int()
@@ -148,6 +150,7 @@ class OctreeModel(PixelModel[OctreeConfigT], DrawsOctree):
             ValueError: if they do not describe an octree, or the number of rows of values differs from the number of
                 leaves.
         """
+        self._largest = None
         edge, counts = float(self.frame[3]), self.bricks.tolist()
         tables = self.densities.table, self.colors.table, self.peaks
         if any(values is not None and len(values) != len(self.cells) for values in tables):
@@ -184,7 +187,21 @@ class OctreeModel(PixelModel[OctreeConfigT], DrawsOctree):
 
     @property
     def largest(self) -> float:
-        return max(error_bound(self.colors.table.detach(), 1.0), 1.0) if not self.training else 1.0
+        if self.training:
+            return 1.0
+        if self._largest is None:  # it reads all leaves, which takes as long as a part of a picture
+            self._largest = max(error_bound(self.colors.table.detach(), 1.0), 1.0)
+        return self._largest
+
+    def train(self: OctreeModelT, mode: bool = True) -> OctreeModelT:
+        """Set training or evaluation mode. Leaves change in training alone, so pictures bound their errors once.
+
+        Args:
+            mode: True for training.
+        """
+        if mode:
+            self._largest = None
+        return super().train(mode)
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
         rendered = self.render(batch.rays, batch.background.repeat_interleave(batch.rays_per_pixel, 0))

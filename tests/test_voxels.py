@@ -21,6 +21,7 @@ from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.encodings.spherical_harmonics import CONSTANT
 from nerfloom.kernels.octree.layout import OctreeLayout
+from nerfloom.kernels.octree.light import error_bound
 from nerfloom.kernels.octree.trace import trace_octree
 from nerfloom.kernels.octree.walk import leaf_at
 from nerfloom.kernels.octree.weights import raise_weights
@@ -243,6 +244,24 @@ def test_leaves_that_no_ray_has_met_stay_once() -> None:
     change(model, 1)
     assert (model.layout.cells() // 2).tolist() == [[0, 0, 7]] * 8
     assert model.peaks.tolist() == [UNMET] * 8
+
+
+def test_pictures_bound_their_errors_once_and_by_the_newest_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, asked = filled(1).eval(), list[int]()
+    monkeypatch.setattr("nerfloom.octree_model.error_bound", lambda *given: asked.append(1) or error_bound(*given))
+    first = model.largest
+    with model.rendering():
+        assert model.largest == first == max(error_bound(model.coefficients(), 1.0), 1.0) > 1
+    assert len(asked) == 1
+    model.train()
+    assert model.largest == 1
+    model.colors.table.data *= 3
+    assert model.eval().largest == error_bound(model.coefficients(), 1.0) > first
+    model.load_state_dict({**model.state_dict(), "colors.table": 2 * model.coefficients()})
+    assert model.largest == error_bound(model.coefficients(), 1.0)
+    model.set_octree(model.layout, model.densities.table.data, 2 * model.coefficients())
+    assert model.largest == error_bound(model.coefficients(), 1.0)
+    assert len(asked) == 4
 
 
 def test_no_more_leaves_than_asked_for(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""Frames per second of trained runs, in colour, along the cameras of their held-out images."""
+"""Frames per second of trained runs, and of files, in colour, along the cameras of held-out images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from nerfloom.cameras.view import View
 from nerfloom.kernels import native
 from nerfloom.renderable import Renderable
 from nerfloom.splats.gaussians import HasGaussians
-from nerfloom.training.trained import load_trained
+from nerfloom.training.load import load
+from nerfloom.training.run_path import trained_run
 
 WARM_UP = 4
 """Number of pictures before the measurement."""
@@ -26,10 +27,10 @@ WARM_UP = 4
 
 @dataclass(frozen=True)
 class Frames:
-    """Rendering times of one run at one size."""
+    """Rendering times of one run or file at one size."""
 
     run: str
-    """Last three folders of the run's path: data, method and time."""
+    """Last three names of its path. Of a run: data, method and time."""
     method: str
     """Name of the method."""
     num_gaussians: int | None
@@ -53,19 +54,25 @@ class Frames:
 
 
 @torch.no_grad()
-def measure(run: Path, widths: tuple[int, ...], threads: tuple[int, ...], count: int) -> list[Frames]:
-    """Render pictures of a trained run on the CPU and measure the time of each.
+def measure(
+    run: Path, widths: tuple[int, ...], threads: tuple[int, ...], count: int, data: Path | None = None
+) -> list[Frames]:
+    """Render pictures on the CPU and measure the time of each.
 
     Args:
-        run: the run's folder.
+        run: the run or file, as `nerfloom.load` takes it.
         widths: widths of the pictures, pixels; heights follow from the cameras.
         threads: numbers of CPU threads.
         count: number of pictures at each size, one held-out camera after another.
+        data: folder of the data: of a file, or of a run if it has moved.
+
+    Raises:
+        ConfigError, CheckpointError, DataError: if it cannot be loaded, or is a file and its data are not given.
     """
-    trained = load_trained(run, device_type="cpu")
-    model, cameras = trained.model, trained.parsed("test").cameras
+    loaded = load(trained_run(run, None, data), device_type="cpu", data=data)
+    model, cameras = loaded.model, loaded.parsed("test").cameras
     gaussians = len(model.gaussians()) if isinstance(model, HasGaussians) else None
-    background, name = model.background, "/".join(run.resolve().parts[-3:])
+    background, name = model.background, "/".join(loaded.origin.resolve().parts[-3:])
     rows = []
     for width in widths:
         sized = [_resized(cameras, index % len(cameras), width) for index in range(count)]
@@ -74,7 +81,7 @@ def measure(run: Path, widths: tuple[int, ...], threads: tuple[int, ...], count:
                 seconds, kernels = _seconds(model, sized, background)
             rows.append(
                 Frames(
-                    name, trained.method, gaussians, width, sized[0].sizes[0][0], number, count,
+                    name, loaded.method, gaussians, width, sized[0].sizes[0][0], number, count,
                     count / sum(seconds), median(seconds), max(seconds), kernels,
                 )
             )  # fmt: skip

@@ -47,6 +47,8 @@ def _command(arguments: list[str]) -> None:
     _check(flags)
     found = flags.check()
     path = flags.output_path or found.parent / "scene.octree"
+    if path.resolve() == found.resolve():
+        raise FlagError(f"ns-bake reads {path} and would replace it by a smaller one; name another file: --output-path")
     make_room(path)
     import time
 

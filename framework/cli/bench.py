@@ -23,7 +23,7 @@ usage: ns-bench WHAT [flags]
   gpu              the same on a GPU, steps as CUDA graphs, and PSNR after 2 to 60 seconds, in less than eight minutes
   methods          time to each PSNR of every built-in method, on the embedded scene or on --data
   profile-step     time of each compiled kernel in a training step, and of Python and torch
-  frames           pictures per second of trained runs, at several sizes and numbers of threads
+  frames           pictures per second of runs and files, at several sizes and numbers of threads
 
 ns-bench WHAT --help shows its flags. Results are written as JSON to docs/results in the working folder, or to
 --output-dir or --output.
@@ -101,10 +101,10 @@ def _frames(flags: FramesFlags) -> None:
 
     if not flags.runs or min(*flags.widths, 8) < 8 or min(*flags.threads, 1) < 1 or flags.pictures < 1:
         raise FlagError(
-            "--runs: name the folders of trained runs; --widths are at least 8, --threads and --pictures at least 1"
+            "--runs: name trained runs or files; --widths are at least 8, --threads and --pictures at least 1"
         )
     make_room(flags.output)
-    rows = [row for run in flags.runs for row in measure(run, flags.widths, flags.threads, flags.pictures)]
+    rows = [row for run in flags.runs for row in measure(run, flags.widths, flags.threads, flags.pictures, flags.data)]
     for row in rows:
         say(
             f"{row.run} {row.method} {row.width}x{row.height}, {row.threads} threads: {row.per_second:.1f} pictures a "

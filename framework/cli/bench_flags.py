@@ -26,10 +26,12 @@ class KernelFlags:
 
 @dataclass(frozen=True)
 class FramesFlags:
-    """Measure colour pictures per second of trained runs on the CPU, along the cameras of held-out images."""
+    """Measure colour pictures per second of runs and files on the CPU, along the cameras of held-out images."""
 
     runs: tuple[Path, ...] = ()
-    """Folders of trained runs."""
+    """Run folders, scenes in blocks, and files of Gaussians, of levels or of octrees, as ns-eval takes them."""
+    data: Path | None = None
+    """Folder of the data of files, or of runs if it has moved."""
     widths: tuple[int, ...] = (400, 540, 1080)
     """Widths of the pictures, pixels; heights follow from the cameras."""
     threads: tuple[int, ...] = (1, 2)

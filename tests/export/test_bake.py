@@ -12,6 +12,7 @@ from torch import Tensor, nn
 import nerfloom
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.poses import Placement
+from nerfloom.cli.bake import main
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.scene import Scene
 from nerfloom.evaluation.metrics import psnr
@@ -35,6 +36,8 @@ from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.testing.ball import RADIUS as BALL_RADIUS
 from nerfloom.testing.scenes import ball_under_a_sky
 from tests.cli.helpers import TINY_NGP, called
+from tests.conftest import Refused
+from tests.octrees.balls import ball
 
 RADIUS, SIGMA = 0.4, 50.0
 BOX = torch.tensor([[-1.0, -1.5, -1.0], [1.0, 1.0, 2.0]])
@@ -265,6 +268,22 @@ def test_a_run_and_its_octree(shared_tiny: Path, tmp_path: Path) -> None:
 def replace_scene(model):
     model.scene = replace(model.scene, unbounded=True)
     return model
+
+
+def test_a_file_of_an_octree_is_not_replaced_by_what_is_left_of_it(tmp_path: Path, refused: Refused) -> None:
+    """Its values are rounded again, to fewer bits."""
+    file, smaller = tmp_path / "scene.octree", tmp_path / "smaller.octree"
+    write_octree(file, ball())
+    before = file.read_bytes()
+    assert "name another file: --output-path" in refused(main, file, status=2)
+    assert file.read_bytes() == before
+    done = called("ns-bake", file, "--output-path", smaller)
+    assert done.returncode == 0, done.stderr
+    found, given = read_octree(smaller), ball()
+    assert found.layout.num_leaves == given.layout.num_leaves
+    assert (found.far, found.has_alpha, found.image_size) == (given.far, given.has_alpha, given.image_size)
+    torch.testing.assert_close(found.leaves.coefficients(), given.leaves.coefficients(), atol=0.05, rtol=0)
+    assert smaller.stat().st_size <= len(before)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """An octree is looked at, judged and exported like a run."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import nerfloom
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
+from nerfloom.cli import bench
 from nerfloom.evaluation.error_bound import limited_error
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.octree.layout import OctreeLayout
@@ -22,6 +24,7 @@ from nerfloom.octrees.files import write_octree
 from nerfloom.octrees.packing import packed
 from nerfloom.registry import load_dataparser
 from tests.cli.helpers import called
+from tests.conftest import Refused
 from tests.octrees.balls import CELL, RADIUS, ball, boxes
 from tests.other_device import OTHER, other_device
 
@@ -137,6 +140,21 @@ def test_commands_open_it(file: Path) -> None:
     assert abs(means.mean() - frames.mean()) < 2
     done = called("ns-render", "orbit", file, "--up=z", "--output-path", file.parent)
     assert "an octree knows which way is up" in done.stderr
+
+
+@pytest.mark.medium
+def test_its_pictures_a_second_are_measured(shared_tiny: Path, tmp_path: Path, refused: Refused) -> None:
+    """Along the cameras of its data; without data there are none."""
+    placement = load_dataparser("blender")().parse(shared_tiny, "train").placement
+    file, output = tmp_path / "x.octree", tmp_path / "frames.json"
+    write_octree(file, replace(ball(), placement=placement))
+    flags = ("--runs", file, "--widths", 20, 30, "--threads", 1, "--pictures", 2, "--output", output)
+    assert "its photographs are unknown: give --data DIR" in refused(bench.main, "frames", *flags)
+    done = called("ns-bench", "frames", *flags, "--data", shared_tiny)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(output.read_text())["frames"]
+    assert [(row["method"], row["width"], row["height"]) for row in rows] == [("octree", 20, 20), ("octree", 30, 30)]
+    assert all(row["run"].endswith("x.octree") and row["per_second"] > 0 for row in rows)
 
 
 @pytest.mark.medium

@@ -52,7 +52,10 @@ def shown(*names: str) -> list[str]:
 
 
 RUNNING = shown("ns-train", "ns-eval", "ns-render", "ns-export")
-RUNS = "outputs/all/instant-ngp/TIME outputs/all/gaussian-splatting/TIME"
+RUNS = (
+    "outputs/all/instant-ngp/TIME outputs/all/gaussian-splatting/TIME exports/splat.ply exports/scene.levels "
+    "exports/scene.octree --data path/to/lego"
+)
 MEASURED = {
     "kernels": "--samples 512 --repeats 1",
     "methods": "--data path/to/lego --max-seconds 1",

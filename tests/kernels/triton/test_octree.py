@@ -11,7 +11,7 @@ from nerfloom.kernels.octree.layout import OctreeLayout
 from nerfloom.kernels.octree.packed import CODES, PackedLeaves, trace_packed
 from nerfloom.kernels.octree.trace import trace_octree, trace_octree_reference
 from nerfloom.kernels.octree.weights import raise_weights
-from tests.kernels.test_octree import CELL, layout_of, scattered
+from tests.kernels.test_octree import CELL, layout_of, scattered, values
 from tests.kernels.test_octree_levels import nested
 from tests.kernels.triton.compared import DEVICE, backends, compare
 
@@ -89,6 +89,23 @@ def test_weights_and_peaks() -> None:
         )
     assert names == ["triton"]
     torch.testing.assert_close(peaks, weights)
+
+
+@pytest.mark.slow
+def test_opaque_empty_and_bright_leaves() -> None:
+    """Optical depths from 0 to 10,000, and colours far above 1."""
+    torch.manual_seed(11)
+    layout = layout_of(scattered(0.3))
+    raw, coefficients = values(layout, 1)
+    raw[::4], raw[1::4], raw[2::4] = 1e4, -1e4, 80.0
+    coefficients[::3] *= 1e4
+
+    def light(raw: Tensor, coefficients: Tensor, background: Tensor, **rays: Tensor) -> tuple[Tensor, ...]:
+        found = trace_octree(layout.to(raw.device), raw, coefficients, Rays(**rays), background)
+        return found.color, found.opacity
+
+    given = {"raw": raw, "coefficients": coefficients, **some_rays(40)}
+    compare(light, {**given, "background": torch.rand(40, 3)}, "raw coefficients", 1e-3)
 
 
 def test_rays_that_meet_nothing() -> None:

@@ -278,8 +278,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     """Construct a data set from decoded images.
 
     Args:
-        parsed: the parsed scene of these images, with cameras for their decoded sizes. Depth images are read; no other
-            file is.
+        parsed: the scene of these images, with cameras for their decoded sizes. Of its files only depths are read.
         decoded: the pixels (`decoding.decode` or `decoding.from_arrays`).
         split: name of the split in messages.
         masks: meaning of masked-out pixels; auto: empty if the format says so, otherwise decided by `cuts_out`.

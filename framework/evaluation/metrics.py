@@ -29,7 +29,7 @@ def psnr(prediction: Tensor, target: Tensor) -> float:
 
 
 def psnr_of_error(error: Tensor) -> float:
-    """Return the PSNR of a mean squared error () of colours in [0, 1], dB; at most 100."""
+    """Return the PSNR of the mean squared `error` () of colours in [0, 1], dB; at most 100."""
     return float(-10 * error.clamp(min=10 ** (-MAX_PSNR / 10)).log10())
 
 

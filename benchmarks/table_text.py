@@ -70,6 +70,7 @@ def all_columns(sizes: Sequence[str], images: Mapping[str, str]) -> list[Column]
         *((heading, of_image(name), "{:.2f} dB".format) for heading, name in images.items()),
         ("against its run", against(sub, "psnr"), "{:+.2f} dB".format),
         ("normal MAE", lambda result: result["results"].get("normal_mae"), "{:.2f}°".format),
+        ("diffuse PSNR", lambda result: result["results"].get("diffuse_psnr"), "{:.2f} dB".format),
         ("floaters", lambda result: result["results"].get("floaters"), "{:.2f} %".format),
         ("Chamfer", of_surface(lambda found: found["chamfer_percent"]), "{:.3f} %".format),
         ("F-score", of_surface(lambda found: 100 * found["f_scores"][0]["f_score"]), "{:.1f} %".format),

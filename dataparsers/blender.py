@@ -20,7 +20,7 @@ from nerfloom.base.console import say
 from nerfloom.base.splits import Split
 from nerfloom.cameras.camera_path import read_transforms
 from nerfloom.cameras.poses import Placement
-from nerfloom.data.normals import normals_beside
+from nerfloom.data import diffuse_light, normals
 from nerfloom.dataparsers.captured import placed_cameras
 from nerfloom.dataparsers.region import HALF_SIZE, Region, cube_at_origin, find_region
 from nerfloom.dataparsers.renders import Renders, read_renders
@@ -89,7 +89,8 @@ class Blender(DataParser):
             scale=placement.scale,
             downscale_factor=self.downscale_factor,
             num_scales=self.multiscale,
-            normal_paths=normals_beside(images.paths),
+            normal_paths=normals.files_beside(images.paths, normals.ENDING),
+            light_paths=normals.files_beside(images.paths, diffuse_light.ENDING),
             unbounded=region.unbounded,
         )
 

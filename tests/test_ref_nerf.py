@@ -191,5 +191,7 @@ def test_training_on_a_mirror(kind: str, steps: int, own: dict[str, object], mir
     assert found.results["psnr"] > before["psnr"] + 1
     assert 0 < found.results["normal_mae"] < 80
     assert "normals off by" in found.line()
+    assert found.results["diffuse_psnr_images"] == len(test)
+    assert "diffuse PSNR" in found.line()
     names = {path.name.split("_", 3)[-1] for path in (tmp_path / "pictures").iterdir()}
     assert {"diffuse.png", "specular.png", "normals.png", "roughness.png"} <= names

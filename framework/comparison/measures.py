@@ -32,6 +32,7 @@ class Measured:
         lpips: mean LPIPS over all evaluated views; None if it was not computed.
         floaters: mean percentage of sparse points with matter in front of them; None without sparse points.
         normal_mae: mean angle between rendered and true normals, degrees; None without either.
+        diffuse_psnr: mean PSNR of diffuse light, dB; None without either.
         steps: number of training steps.
         parameters: number of parameters.
         skipped_steps: number of steps dropped because of non-finite values.
@@ -54,6 +55,7 @@ class Measured:
     lpips: float | None
     floaters: float | None
     normal_mae: float | None
+    diffuse_psnr: float | None
     views: int
     """Number of evaluated views."""
     steps: int
@@ -132,6 +134,7 @@ def measure(planned: PlannedRun, conditions: Conditions) -> Measured | None:
         lpips=results["lpips"],
         floaters=results.get("floaters"),
         normal_mae=results.get("normal_mae"),
+        diffuse_psnr=results.get("diffuse_psnr"),
         views=results["num_images"],
         steps=summary["steps"],
         seconds=summary["seconds"],

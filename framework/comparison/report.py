@@ -50,6 +50,7 @@ COLUMNS = (
     Column(f"LPIPS ({NETWORK})", "lpips", "{:.4f}".format, min),
     Column("floaters, %", "floaters", "{:.1f}".format, min),
     Column("normals of views, °", "normal_mae", "{:.2f}".format, min),
+    Column("diffuse PSNR, dB", "diffuse_psnr", "{:.2f}".format, max),
     Column("Chamfer, % of side", "chamfer", "{:.3f}".format, min),
     Column("F-score, %", "f_score", "{:.1f}".format, max),
     Column("normals, °", "normal_error", "{:.2f}".format, min),
@@ -297,7 +298,10 @@ def _markdown_table(head: list[str], rows: list[dict[str, Any]]) -> list[str]:
     return lines
 
 
-QUALITY = ("psnr", "ssim", "ms_ssim", "lpips", "floaters", "normal_mae", "chamfer", "f_score", "normal_error", "faces")
+QUALITY = (
+    *("psnr", "ssim", "ms_ssim", "lpips", "floaters", "normal_mae", "diffuse_psnr"),
+    *("chamfer", "f_score", "normal_error", "faces"),
+)
 """Measures of the rendered views and of the surface."""
 CSV_FIGURES = ("label", "method", "seed", *QUALITY, "views", "steps", "seconds", "rays_per_second")
 """First columns of results.csv."""

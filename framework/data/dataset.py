@@ -22,6 +22,7 @@ from nerfloom.cameras.view import View
 from nerfloom.data.coverage import pixels_with_rays
 from nerfloom.data.decoding import Decoded, ImageFiles, decode
 from nerfloom.data.depths import read_depths
+from nerfloom.data.diffuse_light import read_diffuse
 from nerfloom.data.exposure import devices_of, exposures_of, read_taken
 from nerfloom.data.light_spread import APPEARANCE_STOPS, light_spread
 from nerfloom.data.motion_bound import MotionBound
@@ -83,6 +84,8 @@ class Dataset:
     """Whether these are training images, in the order of a model's vectors for them."""
     normal_paths: tuple[Path | None, ...] | None = None
     """M files of true normals, read when asked for; None if there are none."""
+    light_paths: tuple[Path | None, ...] | None = None
+    """M files of true diffuse light, read when asked for; None if there are none."""
     motion_bound: MotionBound | None = None
     """Distance that matter may move, on the CPU, estimated from the images; None if unknown or not needed."""
 
@@ -172,6 +175,18 @@ class Dataset:
         height, width = self.cameras.sizes[index]
         turn = self.transform[:, :3].to(self.device, torch.float32)
         return read_normals(path, width, height).to(self.device) @ turn.T
+
+    def diffuse_of(self, index: int) -> Tensor | None:
+        """Return the true diffuse light of image `index`, (H, W, 3) linear; None if unknown.
+
+        Raises:
+            DataError: if the file is invalid.
+        """
+        path = None if self.light_paths is None else self.light_paths[index]
+        if path is None:
+            return None
+        height, width = self.cameras.sizes[index]
+        return read_diffuse(path, width, height).to(self.device)
 
     def drawing(self, pixels: PixelSet) -> Dataset:
         """Return the data set with `drawn` restricted to `pixels`; unchanged if that would leave none."""
@@ -263,8 +278,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
     """Construct a data set from decoded images.
 
     Args:
-        parsed: the parsed scene of these images, with cameras for their decoded sizes. Depth images are read; no other
-            file is.
+        parsed: the scene of these images, with cameras for their decoded sizes. Of its files only depths are read.
         decoded: the pixels (`decoding.decode` or `decoding.from_arrays`).
         split: name of the split in messages.
         masks: meaning of masked-out pixels; auto: empty if the format says so, otherwise decided by `cuts_out`.
@@ -323,6 +337,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         source_images=parsed.source_images,
         training=split == "train",
         normal_paths=parsed.normal_paths,
+        light_paths=parsed.light_paths,
     )
 
 

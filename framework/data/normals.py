@@ -18,9 +18,9 @@ ENDING = "_normal.png"
 """End of a normal image's name, after the name of its image without the suffix."""
 
 
-def normals_beside(images: Sequence[Path]) -> tuple[Path | None, ...] | None:
-    """Return the normal image beside each of `images`, or None; None if no image has one."""
-    found = tuple(path.with_name(path.stem + ENDING) for path in images)
+def files_beside(images: Sequence[Path], ending: str) -> tuple[Path | None, ...] | None:
+    """Return the file with an `ending` after its name beside each of `images`, or None; None if no image has one."""
+    found = tuple(path.with_name(path.stem + ending) for path in images)
     known = tuple(path if path.is_file() else None for path in found)
     return known if any(known) else None
 

@@ -64,6 +64,8 @@ class ParsedScene:
     """Units of the input per unit of a stored depth: 0.001 for an input in metres and depths in millimetres."""
     normal_paths: tuple[Path | None, ...] | None = None
     """M files of true normals in the input's axes, for evaluation; None for an image without normals."""
+    light_paths: tuple[Path | None, ...] | None = None
+    """M files of true diffuse light, for evaluation; None for an image without one."""
     object_distances: tuple[float, float] | None = None
     """Near and far for an object that lies in `box` and that masks cut out, so that masked-out pixels are background;
     None if masks only hide pixels."""
@@ -98,6 +100,7 @@ class ParsedScene:
             mask_paths=None if self.mask_paths is None else tuple(self.mask_paths[i] for i in chosen),
             depth_paths=None if self.depth_paths is None else tuple(self.depth_paths[i] for i in chosen),
             normal_paths=None if self.normal_paths is None else tuple(self.normal_paths[i] for i in chosen),
+            light_paths=None if self.light_paths is None else tuple(self.light_paths[i] for i in chosen),
             points=points,
             observations=observations,
             sightings=None if self.sightings is None else self.sightings.of_images(index),

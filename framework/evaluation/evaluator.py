@@ -24,6 +24,7 @@ from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.appearance import held_out_appearance, right_half
+from nerfloom.evaluation.diffuse import diffuse_psnr
 from nerfloom.evaluation.lpips import MIN_SIDE_OF_LPIPS, NETWORK, Lpips, load_lpips
 from nerfloom.evaluation.metrics import MIN_SIDE_OF_SCALES, ms_ssim, psnr, quick_ssim
 from nerfloom.evaluation.normals import normal_mae
@@ -126,8 +127,8 @@ class Evaluation:
     """Metrics of a set of images."""
 
     per_image: list[dict[str, Any]]
-    """Name, psnr, ssim, ms_ssim, lpips, normal_mae, floaters and rendering seconds of each image; the numbers of its
-    counted and masked pixels; and the image's reduction if images have several sizes."""
+    """Name, psnr, ssim, ms_ssim, lpips, normal_mae, diffuse_psnr, floaters and rendering seconds of each image; the
+    numbers of its counted and masked pixels; and the image's reduction if images have several sizes."""
     results: dict[str, Any]
     """Means, standard deviations and rendering speed, with nerfstudio's keys; the number of images in each mean; the
     numbers of counted and of masked pixels; by_size, the statistics of images of each size."""
@@ -176,12 +177,13 @@ class Evaluation:
         ssim, scales, lpips = (self._mean(name) for name in ("ssim", "ms_ssim", "lpips"))
         scales = "" if r["ms_ssim"] is None and not r["num_ignored_pixels"] else f"  MS-SSIM {scales}"
         before = "" if r["floaters"] is None else f"  floaters {r['floaters']:.1f} %"
-        normals = "" if r["normal_mae"] is None else f"  normals off by {r['normal_mae']:.2f}°"
+        parts = "" if r["normal_mae"] is None else f"  normals off by {r['normal_mae']:.2f}°"
+        parts += "" if r["diffuse_psnr"] is None else f"  diffuse PSNR {r['diffuse_psnr']:.2f} dB"
         rays = r["num_rays_per_sec"]
         speed = f"{rays / 1e3:.1f}k rays/s  {1 / r['fps']:.2f} s/image" if rays else f"{r['fps']:.1f} images/s"
         sizes = ", ".join(f"{size}: {found['psnr']:.2f}" for size, found in r.get("by_size", {}).items())
         sizes = f" ({sizes})" if sizes else ""
-        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS ({NETWORK}) {lpips}{before}{normals}"
+        quality = f"PSNR {r['psnr']:.2f} dB{sizes}  SSIM {ssim}{scales}  LPIPS ({NETWORK}) {lpips}{before}{parts}"
         count, of = r["num_images"], r["num_images_in_split"]
         kept, ignored = r["num_pixels"], r["num_ignored_pixels"]
         masks = f", {kept:,} pixels; masks ignore {ignored / (kept + ignored):.0%}" if ignored else ""
@@ -312,6 +314,7 @@ def _judge(
     row["pixels"] = pair[0][..., 0].numel() if kept is None else int(kept.sum())
     row["ignored_pixels"] = pair[0][..., 0].numel() - row["pixels"]
     row["normal_mae"] = normal_mae(picture, dataset, index, half)
+    row["diffuse_psnr"] = diffuse_psnr(picture, dataset, index, half)
     return row | {"floaters": floaters(picture, dataset, index)}, Judged(rgb, target, picture)
 
 

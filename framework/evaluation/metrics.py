@@ -25,8 +25,12 @@ MIN_SIDE_OF_SCALES = WINDOW << (len(EXPONENTS) - 1)
 
 def psnr(prediction: Tensor, target: Tensor) -> float:
     """Compute the PSNR of `prediction` against `target`, colours in [0, 1], dB; 100 for identical images."""
-    error = (to_float64(prediction) - to_float64(target)).square().mean().clamp(min=10 ** (-MAX_PSNR / 10))
-    return float(-10 * error.log10())
+    return psnr_of_error((to_float64(prediction) - to_float64(target)).square().mean())
+
+
+def psnr_of_error(error: Tensor) -> float:
+    """Return the PSNR of the mean squared `error` () of colours in [0, 1], dB; at most 100."""
+    return float(-10 * error.clamp(min=10 ** (-MAX_PSNR / 10)).log10())
 
 
 def ssim(prediction: Tensor, target: Tensor, counted: Tensor | None = None) -> float:

@@ -30,14 +30,26 @@ def normal_mae(picture: Picture, dataset: Dataset, index: int, half: bool) -> fl
     truth = dataset.normals_of(index)
     if truth is None or NORMALS.name not in picture.extras:
         return None
+    found, weights = picture.extras[NORMALS.name], object_weights(picture, dataset, index)
+    return mean_angle(*((right_half(each) if half else each) for each in (found, truth, weights)))
+
+
+def object_weights(picture: Picture, dataset: Dataset, index: int) -> Tensor:
+    """Return the weights (H, W) of pixels where properties of an object's surface are compared.
+
+    Args:
+        picture: the rendered view.
+        dataset: the views.
+        index: index of the view.
+
+    Returns:
+        Rendered opacity times the alpha of the true image, if it has any; 0 for ignored pixels.
+    """
     image, kept = dataset.image(index), dataset.kept_of(index)
     weights = picture.accumulation
     if image.shape[-1] == 4:
         weights = weights * image[..., 3] / 255
-    if kept is not None:
-        weights = weights * kept
-    found = picture.extras[NORMALS.name]
-    return mean_angle(*((right_half(each) if half else each) for each in (found, truth, weights)))
+    return weights if kept is None else weights * kept
 
 
 def mean_angle(found: Tensor, truth: Tensor, weights: Tensor) -> float | None:

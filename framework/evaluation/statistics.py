@@ -36,7 +36,7 @@ def _by_size(rows: Rows) -> dict[str, Any]:
 def _of_metrics(rows: Rows) -> dict[str, float | None]:
     """Return the mean, the standard deviation and the number of images of each metric."""
     found: dict[str, float | None] = {}
-    for name in ("psnr", "ssim", "ms_ssim", "lpips", "floaters", "normal_mae"):
+    for name in ("psnr", "ssim", "ms_ssim", "lpips", "floaters", "normal_mae", "diffuse_psnr"):
         values = [row[name] for row in rows if row[name] is not None]
         found[name] = fmean(values) if values else None
         found[f"{name}_std"] = _deviation(values) if values else None

@@ -54,6 +54,8 @@ FIXED = RGB, DEPTH, MEDIAN_DEPTH, ACCUMULATION
 """Outputs of every method: fields of `Rendered`, `Pixels` and `Picture`."""
 NORMALS = Output("normals", "direction")
 """Outward directions of surfaces."""
+DIFFUSE = Output("diffuse", "color")
+"""Light that leaves surfaces equally in all directions, in display colours over black."""
 
 
 def empty(outputs: tuple[Output, ...], count: int, device: torch.device) -> dict[str, Tensor]:

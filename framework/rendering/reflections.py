@@ -11,12 +11,12 @@ from nerfloom.fields.directional import HasLight
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.color import to_srgb
 from nerfloom.kernels.compositing.density import ray_sum
-from nerfloom.rendering.outputs import NORMALS, Output
+from nerfloom.rendering.outputs import DIFFUSE, NORMALS, Output
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.volume import VolumeRenderer, volume_render
 
-DIFFUSE, SPECULAR = Output("diffuse", "color"), Output("specular", "color")
-"""Light that leaves surfaces equally in all directions, and reflected light, each in display colours over black."""
+SPECULAR = Output("specular", "color")
+"""Reflected light, in display colours over black."""
 ROUGHNESS = Output("roughness", "scalar")
 """Inverse concentration of reflected directions; 0 is a mirror."""
 

@@ -92,6 +92,10 @@ def test_scenes_are_written_and_read_as_shiny_blenders(shiny: Path) -> None:
     }  # fmt: skip
     _, _, light = render_shiny(np.array(frames[1]["transform_matrix"]), 24, SCENES["together"], LAMPS)
     assert light is not None
+    diffuse = dataset.diffuse_of(1)
+    assert diffuse is not None
+    torch.testing.assert_close(diffuse.view(-1, 3), light.diffuse.T.float())
+    assert load_dataset(Blender().parse(folder, "train"), "train").diffuse_of(0) is None
     normals, alpha = dataset.normals_of(1), dataset.image(1)[..., 3].flatten()
     assert normals is not None
     inside = (alpha == 255).float()

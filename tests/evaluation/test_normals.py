@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import Dataset
-from nerfloom.data.normals import normals_beside, read_normals
+from nerfloom.data.normals import ENDING, files_beside, read_normals
 from nerfloom.evaluation.normals import mean_angle, normal_mae
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.rendered import Picture
@@ -83,9 +83,9 @@ def test_without_normals_there_is_no_angle(ball: Dataset) -> None:
 
 def test_normals_are_found_beside_images(tmp_path: Path) -> None:
     images = [tmp_path / "r_0.png", tmp_path / "r_1.png"]
-    assert normals_beside(images) is None
+    assert files_beside(images, ENDING) is None
     (tmp_path / "r_1_normal.png").touch()
-    assert normals_beside(images) == (None, tmp_path / "r_1_normal.png")
+    assert files_beside(images, ENDING) == (None, tmp_path / "r_1_normal.png")
 
 
 def test_a_larger_file_is_read_at_the_images_size(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from nerfloom.cameras.scale import Scale, read_scale, write_scale
 from nerfloom.cli.compare import CompareFlags, plan_of
 from nerfloom.data.dataset import load_dataset
 from nerfloom.data.depths import read_depth
+from nerfloom.data.diffuse_light import read_diffuse
 from nerfloom.data.normals import read_normals
 from nerfloom.data.pixels.cache import PixelMemory, pack, unpack
 from nerfloom.data.pixels.memory_mapped import MappedPixels
@@ -521,6 +522,19 @@ def read_images_of_normals(folder: Path, scratch: Path) -> None:
         require(bool(((normals.norm(dim=-1) - 1).abs() < 1e-3).all()), "other lengths than 1")
 
 
+def write_diffuse(folder: Path) -> None:
+    light = noise(20, 15, 3)[..., :3].astype(np.float32) / 255
+    np.savez_compressed(folder / "0_light.npz", diffuse=light, roughness=light[..., :1])
+    np.savez(folder / "1_light.npz", diffuse=light)
+
+
+def read_files_of_light(folder: Path, scratch: Path) -> None:
+    for file in sorted(folder.glob("*.npz")):
+        light = read_diffuse(file, 20, 15)
+        require(light.shape == (15, 20, 3), "another shape")
+        require(bool((light.isfinite() & (light >= 0)).all()), "light that is negative or not finite")
+
+
 def write_archive(folder: Path) -> None:
     """Text, an image, and an entry that is stored as it is."""
     with zipfile.ZipFile(folder / "scenes.zip", "w") as archive:
@@ -615,6 +629,7 @@ READERS: dict[str, Reader] = {
     "depths": Reader(write_masked, partial(load, Nerfstudio(), MEMORY), ("depths/*",)),
     "depths-exr": Reader(write_exr_depths, read_exr_depths, ("*.exr",)),
     "normals": Reader(write_normals, read_images_of_normals, ("*.png",)),
+    "diffuse-light": Reader(write_diffuse, read_files_of_light, ("*.npz",)),
     "photographs": Reader(write_photographs, read_photographs, ("*",)),
     "polycam-raw": Reader(write_polycam, convert_polycam, ("keyframes/cameras/*.json",), ("blur_score", "fx", "width")),
     "record3d-raw": Reader(

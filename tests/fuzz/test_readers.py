@@ -23,7 +23,7 @@ READERS = (
     "phototourism", "ply", "surfaces", "splats", "camera-path", "images", "images-to-a-file", "masks", "depths",
     "photographs", "polycam-raw", "record3d-raw", "config", "comparison", "checkpoint", "run", "archive", "pixel-cache",
     "lpips-weights", "depths-exr", "normals", "dtu", "sdfstudio", "octree", "scale", "edits", "blocks", "metashape",
-    "realitycapture", "odm", "aria", "bundler", "levels", "visibility",
+    "realitycapture", "odm", "aria", "bundler", "levels", "visibility", "diffuse-light",
 )  # fmt: skip
 """Their names here too, so that tests are collected without reading anything."""
 ASKED = [

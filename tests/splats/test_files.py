@@ -452,6 +452,19 @@ def test_harmonics_rotate_as_a_group() -> None:
     assert float(rotated_harmonics(harmonics, first).norm()) == pytest.approx(float(harmonics.norm()))
 
 
+def test_harmonics_of_a_reflected_direction_are_harmonics_of_the_viewing_direction() -> None:
+    """So a method that evaluates a Gaussian's own harmonics in the direction that it reflects gains no new colours."""
+    normal = torch.nn.functional.normalize(
+        torch.randn(3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)), dim=0
+    )
+    mirror = torch.eye(3).double() - 2 * torch.outer(normal, normal)
+    harmonics, where = some(5).harmonics.double(), torch.stack(list(directions()))
+    reflected = where - 2 * (where @ normal)[:, None] * normal
+    expected = harmonics @ spherical_harmonics_reference(reflected, 4)[:, 1:].T
+    found = rotated_harmonics(harmonics, mirror) @ spherical_harmonics_reference(where, 4)[:, 1:].T
+    torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
+
+
 def test_quaternions() -> None:
     half_turns = [torch.diag(torch.tensor(signs)).double() for signs in ((1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
     for rotation in [torch.eye(3).double(), *half_turns, *(turn(seed) for seed in range(20))]:

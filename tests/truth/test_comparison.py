@@ -15,12 +15,14 @@ from tests.comparison.runs import CONDITIONS, finish, plan
 BETTER = {
     "PSNR, dB": 31.0, "SSIM": 0.95, "MS-SSIM": 0.98, "LPIPS (alex)": 0.05, "floaters, %": 1.0, "training, s": 50.0,
     "Chamfer, % of side": 0.1, "F-score, %": 90.0, "normals, °": 5.0, "faces": 900, "normals of views, °": 6.0,
+    "diffuse PSNR, dB": 25.0,
     "steps": 2000, "training, rays/s": 3e5, "rendering, s/image": 0.2, "peak memory, GiB": 2**29, "parameters": 1000,
 }  # fmt: skip
 """Better values of each column, from the meaning of the metric, not from the report."""
 WORSE = {
     "PSNR, dB": 30.0, "SSIM": 0.9, "MS-SSIM": 0.93, "LPIPS (alex)": 0.1, "floaters, %": 2.0, "training, s": 60.0,
     "Chamfer, % of side": 0.2, "F-score, %": 80.0, "normals, °": 9.0, "faces": 100, "normals of views, °": 8.0,
+    "diffuse PSNR, dB": 20.0,
     "steps": 1000, "training, rays/s": 1e5, "rendering, s/image": 0.4, "peak memory, GiB": 2**30, "parameters": 9000,
 }  # fmt: skip
 
@@ -45,6 +47,7 @@ def finished(planned: PlannedRun, figures: dict[str, float]) -> Measured:
         "lpips": figures["LPIPS (alex)"],
         "floaters": figures["floaters, %"],
         "normal_mae": figures["normals of views, °"],
+        "diffuse_psnr": figures["diffuse PSNR, dB"],
         "fps": 1 / figures["rendering, s/image"],
     }
     evaluation["geometry"] = {

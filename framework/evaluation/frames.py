@@ -98,7 +98,7 @@ class Frames:
 
     @contextmanager
     def resumable(self) -> Iterator[None]:
-        """If an error ends the `with` block, keep what is there, and after Ctrl-C say how much it is."""
+        """Keep what is there if an error ends the `with` block, and after Ctrl-C say how much it is."""
         try:
             yield
         except BaseException as error:

@@ -21,7 +21,7 @@ refers to no other, so short parts make a large file."""
 
 
 def part_length(frame_bytes: int) -> int:
-    """Return the minimum number of frames of a part from the number of bytes of a frame."""
+    """Return the minimum number of frames of a part from `frame_bytes`, the number of bytes of a frame."""
     return max(PART_BYTES // frame_bytes, MIN_PART)
 
 

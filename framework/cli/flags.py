@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 import re
@@ -67,6 +68,17 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
         raise FlagError(str(error)) from error
     sys.stderr.write(said.getvalue())
     return settings
+
+
+def words_of(settings: Any, kind: type[Any]) -> list[str]:
+    """Return the words from which `read_flags` reads the values of `settings` that are not the default.
+
+    Args:
+        settings: a dataclass with values that are one word each: texts, numbers, paths and truth values.
+        kind: `settings`' class, or a base class, for the values of the base class alone.
+    """
+    values = [(field, getattr(settings, field.name)) for field in dataclasses.fields(kind)]
+    return [f"--{field.name.replace('_', '-')}={value}" for field, value in values if value != field.default]
 
 
 def numbers_in(text: str, count: int, name: str, what: str) -> list[float]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from nerfloom.base.errors import FlagError
 from nerfloom.base.machine_config import ViewerConfig
 from nerfloom.cli.common import run_command, with_format, with_run
-from nerfloom.cli.flags import read_flags
+from nerfloom.cli.flags import read_flags, words_of
 from nerfloom.cli.run_flags import OPENS, RunFlags
 from nerfloom.training.run_path import trained_run
 from nerfloom.viewer.server import check_installed
@@ -45,13 +45,18 @@ def _command(arguments: list[str]) -> None:
     found, second = flags.check(), None if other is None else other.check()
     file = None if flags.while_moving is None else trained_run(flags.while_moving, None, None)
     from nerfloom.training.load import load
+    from nerfloom.viewer.commands import Commands
     from nerfloom.viewer.trained_viewer import view_loaded
 
     loaded = flags.load(found, named)
+    # Not the folder that was named, which may hold a newer run by then.
+    opens = words_of(replace(flags, load_config=loaded.origin), RunFlags)
+    if named is not None:
+        opens += [named[0], *words_of(named[1], type(named[1]))]
     follow = flags.load_checkpoint is None and loaded.is_run
     beside = None if other is None or second is None else other.load(second, named)
     quick = None if file is None else load(file, device_type=flags.device_type)
-    view_loaded(loaded, flags.websocket_host, flags.websocket_port, follow, beside, quick)
+    view_loaded(loaded, flags.websocket_host, flags.websocket_port, Commands(opens), follow, beside, quick)
 
 
 def _without_prefix(word: str) -> str:

@@ -1,7 +1,8 @@
 """Frames of a long render, kept on disk until its files are written, so that a stopped render can continue.
 
 They are in FILE.frames/KEY/ beside the rendered file or folder. The key is a hash of everything that the frames depend
-on, so frames of one command are never used for another. render.json holds the hashed facts.
+on, so frames of one command are never used for another. render.json holds the hashed facts. Frames of a video are
+replaced by encoded parts of it while others are rendered (`video/film.py`).
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ import json
 import shutil
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -50,6 +51,19 @@ class Frames:
     """Folder of these frames only."""
     count: int
     """Number of frames in the whole render."""
+    part_length: int | None = None
+    """Minimum number of frames that are encoded together and then removed; None: all stay."""
+
+    @property
+    def parts(self) -> list[range]:
+        """The indices of the frames of each part, in order. The last part is the longest."""
+        length = self.count if self.part_length is None else self.part_length
+        starts = [length * number for number in range(max(self.count // length, 1))]
+        return [range(*ends) for ends in zip(starts, [*starts[1:], self.count], strict=True)]
+
+    def part_path(self, part: range) -> Path:
+        """Return the path of an encoded `part`."""
+        return self.folder / f"{part[0]:06d}-{part[-1]:06d}.mp4"
 
     def path(self, index: int) -> Path:
         """Return the path of frame `index`."""
@@ -65,51 +79,78 @@ class Frames:
 
     def __iter__(self) -> Iterator[Arrays]:
         """Yield the arrays of every frame, in order."""
-        for index in range(self.count):
+        return self.read_all(range(self.count))
+
+    def read_all(self, indices: range) -> Iterator[Arrays]:
+        """Yield the arrays of the frames `indices`, in order."""
+        for index in indices:
             if (kept := self.read(index)) is None:
                 raise ConfigError(f"{self.path(index)} is missing or damaged; start the same command again")
             yield kept
 
-    def render(self, render: Callable[[int], Arrays]) -> None:
-        """Render the missing frames by `render(index)`, and say after the second how long the others will take.
-
-        Raises:
-            ConfigError: if a frame cannot be written.
-        """
-        missing = [index for index in range(self.count) if self.read(index) is None]
-        if done := self.count - len(missing):
+    def missing(self) -> list[int]:
+        """Return the indices of the frames that are neither kept nor encoded, and say how many are there."""
+        left = [index for part in self.parts if not self.part_path(part).exists() for index in part]
+        found = [index for index in left if self.read(index) is None]
+        if done := self.count - len(found):
             say(f"{done} of {self.count} frames already exist in {self.folder}; rendering the others")
+        return found
+
+    @contextmanager
+    def resumable(self) -> Iterator[None]:
+        """Keep what is there if an error ends the `with` block, and after Ctrl-C say how much it is."""
         try:
-            with ThreadPoolExecutor(1) as writer:  # a frame is written while the next one is rendered
-                self._render(missing, render, writer)
+            yield
         except BaseException as error:
-            done = sum(self.path(index).exists() for index in range(self.count))
+            encoded = {index for part in self.parts if self.part_path(part).exists() for index in part}
+            done = sum(index in encoded or self.path(index).exists() for index in range(self.count))
             if not done:  # nothing to continue
                 self.remove()
             elif isinstance(error, KeyboardInterrupt):
                 say(f"{done} of {self.count} frames are in {self.folder}; repeat the command to continue")
             raise
 
-    def _render(self, missing: list[int], render: Callable[[int], Arrays], writer: ThreadPoolExecutor) -> None:
-        """Render the `missing` frames, and let `writer` write them, at most one late."""
-        last: Future[None] | None = None
-        for number, index in enumerate(track(missing, "Rendering", total=len(missing)), 1):
-            start = time.monotonic()
-            arrays = render(index)
+    def render(self, render: Callable[[int], Arrays]) -> None:
+        """Render the missing frames by `render(index)`, as in `rendered`.
+
+        Raises:
+            ConfigError: if a frame cannot be written.
+        """
+        with self.resumable():
+            for _ in self.rendered(self.missing(), render):
+                pass
+
+    def rendered(self, missing: Sequence[int], render: Callable[[int], Arrays]) -> Generator[int, None, None]:
+        """Render the `missing` frames by `render(index)`, and yield the index of each when it is on the disk.
+
+        A frame is written while the next one is rendered. After the second, say how long the others will take.
+
+        Raises:
+            ConfigError: if a frame cannot be written.
+        """
+        last: tuple[int, Future[None]] | None = None
+        with ThreadPoolExecutor(1) as writer:
+            for number, index in enumerate(track(missing, "Rendering", total=len(missing)), 1):
+                start = time.monotonic()
+                arrays = render(index)
+                seconds = time.monotonic() - start
+                if last is not None:
+                    last[1].result()
+                    yield last[0]
+                last = index, writer.submit(self._keep, index, arrays)
+                if number == TIMED and (left := len(missing) - number):
+                    say(f"the other {left:,} frames take about {time_text(seconds * left)}")
             if last is not None:
-                last.result()
-            last = writer.submit(self._keep, index, arrays)
-            if number == TIMED and (left := len(missing) - number):
-                say(f"the other {left:,} frames take about {time_text((time.monotonic() - start) * left)}")
-        if last is not None:
-            last.result()
+                last[1].result()
+                yield last[0]
 
     def _keep(self, index: int, arrays: Arrays) -> None:
-        """Write frame `index`, compressed if all frames together would be large.
+        """Write frame `index`, compressed if all frames that are kept together would be large.
 
         It is not flushed to the disk: `read` refuses a damaged frame, which is then rendered again.
         """
-        plain = self.count * sum(values.nbytes for values in arrays.values()) <= MAX_PLAIN
+        together = self.count if self.part_length is None else 3 * self.part_length
+        plain = together * sum(values.nbytes for values in arrays.values()) <= MAX_PLAIN
         method = zipfile.ZIP_STORED if plain else zipfile.ZIP_DEFLATED
 
         def write(file: BinaryIO) -> None:
@@ -127,8 +168,10 @@ class Frames:
             self.folder.parent.rmdir()
 
 
-def open_frames(output: Path, count: int, facts: dict[str, Any]) -> Frames:
+def open_frames(output: Path, count: int, facts: dict[str, Any], part_length: int | None = None) -> Frames:
     """Return `count` frames for `output`, with the frames of an earlier, stopped run that had the same `facts`.
+
+    `part_length` is as in `Frames`.
 
     Raises:
         ConfigError: if the folder of the frames cannot be written.
@@ -142,7 +185,7 @@ def open_frames(output: Path, count: int, facts: dict[str, Any]) -> Frames:
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror or error}; use another path") from error
     write_file(folder / FACTS, (json.dumps(facts, indent=2) + "\n").encode())
-    return Frames(folder, count)
+    return Frames(folder, count, part_length)
 
 
 def key_of(facts: dict[str, Any]) -> str:

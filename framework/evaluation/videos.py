@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable, Iterator
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,7 +28,7 @@ MAX_UINT16 = 65_535
 
 
 def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """Write a video or an endless animation; an earlier file stays until the new one is complete.
+    """Write a video or an endless animation; an earlier file stays until the new one is complete and on the disk.
 
     Args:
         path: file to write; its suffix is the format: .mp4 (H.264), .gif, .webp or .png.
@@ -37,14 +38,48 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     Raises:
         ConfigError: if the file cannot be written.
     """
+    with _whole(path) as temporary:
+        if path.suffix.lower() == VIDEO:
+            _write_mp4(temporary, pictures, fps)
+        else:
+            _write_animation(temporary, pictures, fps)
+
+
+def join_videos(path: Path, parts: Sequence[Path], seconds: Sequence[float]) -> None:
+    """Write the pictures of several videos one after another, as they are encoded, to one video.
+
+    Args:
+        path: .mp4 file to write.
+        parts: .mp4 files of `write_video`, of one size and speed, in one folder, in which their list is written. They
+            have at least five pictures each, or the encoder does not delay all of them by the same number of pictures.
+        seconds: their exact durations; the files round them to milliseconds.
+
+    Raises:
+        ConfigError: if the file cannot be written.
+    """
+    import imageio_ffmpeg
+
+    listed = parts[0].with_name("parts.txt")
+    with _whole(path) as temporary:
+        lines = [f"file '{part.name}'\nduration {length:.6f}\n" for part, length in zip(parts, seconds, strict=True)]
+        listed.write_text("".join(lines), encoding="utf-8")
+        words = ["-v", "error", "-f", "concat", "-i", listed, "-c", "copy", "-movflags", "+faststart", "-y", temporary]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), *map(str, words)]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        if done.returncode:
+            raise RuntimeError(done.stderr.decode(errors="replace"))
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Yield a temporary file that takes the place of `path`, when the block has written it and it is on the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         with _written(path):
-            if path.suffix.lower() == VIDEO:
-                _write_mp4(temporary, pictures, fps)
-            else:
-                _write_animation(temporary, pictures, fps)
+            yield temporary
+            with temporary.open("rb+") as file:
+                os.fsync(file.fileno())
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

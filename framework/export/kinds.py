@@ -39,6 +39,8 @@ class Kind(NamedTuple):
     """Suffixes that its file may have."""
     writer: Callable[[], Writer]
     """Imports the function that writes the file, and returns it."""
+    suits: Callable[[Loaded], bool]
+    """Returns whether a run or a file has what the export needs."""
     is_cropped: bool = False
     """Whether it takes regions."""
 
@@ -79,6 +81,11 @@ def check_scale(loaded: Loaded) -> None:
     """
     if loaded.model.scene.warped:
         raise ConfigError("this run is in normalised device coordinates (--ndc), which have no scale to export")
+
+
+def kinds_of(loaded: Loaded) -> dict[str, Kind]:
+    """Return the kinds of export that suit a run or a file, by name."""
+    return {name: kind for name, kind in KINDS.items() if kind.suits(loaded)}
 
 
 def kind_named(name: str) -> Kind:
@@ -143,14 +150,48 @@ def _page() -> Writer:
     return export_page
 
 
+# What they need; the writers say it in their errors.
+
+
+def _has_photographs(loaded: Loaded) -> bool:
+    return loaded.source is not None
+
+
+def _has_surface(loaded: Loaded) -> bool:
+    from nerfloom.renderable import HasDensity, HasSignedDistance
+
+    return isinstance(loaded.model, (HasDensity, HasSignedDistance)) and _has_photographs(loaded)
+
+
+def _has_gaussians(loaded: Loaded) -> bool:
+    from nerfloom.splats.gaussians import HasGaussians
+
+    return isinstance(loaded.model, HasGaussians)
+
+
+def _has_cells(loaded: Loaded) -> bool:
+    from nerfloom.renderable import parts
+    from nerfloom.samplers.base import SkipsCells
+
+    return bool(parts(loaded.model, SkipsCells))
+
+
+def _has_page(loaded: Loaded) -> bool:
+    from nerfloom.export.run_page import kind_of
+
+    return kind_of(loaded.model) != "gaussians" or _has_gaussians(loaded) or _has_photographs(loaded)
+
+
 KINDS: dict[str, Kind] = {
-    "pointcloud": Kind(PointSettings, (".ply",), _points, is_cropped=True),
-    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set, is_cropped=True),
-    "tsdf": Kind(TsdfSettings, MESHES, _fused, is_cropped=True),
-    "gaussian-splat": Kind(SplatSettings, (".ply", ".spz", ".sog", ".glb"), _gaussians, is_cropped=True),
-    "levels": Kind(LevelsSettings, (".levels",), _levels, is_cropped=True),
-    "cameras": Kind(CameraSettings, (".json",), _cameras),
-    "occupancy": Kind(OccupancySettings, (".npz",), _occupancy),
-    "web": Kind(WebSettings, (".html",), _page, is_cropped=True),
+    "pointcloud": Kind(PointSettings, (".ply",), _points, _has_photographs, is_cropped=True),
+    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set, _has_surface, is_cropped=True),
+    "tsdf": Kind(TsdfSettings, MESHES, _fused, _has_photographs, is_cropped=True),
+    "gaussian-splat": Kind(
+        SplatSettings, (".ply", ".spz", ".sog", ".glb"), _gaussians, _has_gaussians, is_cropped=True
+    ),
+    "levels": Kind(LevelsSettings, (".levels",), _levels, _has_gaussians, is_cropped=True),
+    "cameras": Kind(CameraSettings, (".json",), _cameras, _has_photographs),
+    "occupancy": Kind(OccupancySettings, (".npz",), _occupancy, _has_cells),
+    "web": Kind(WebSettings, (".html",), _page, _has_page, is_cropped=True),
 }
 """Kinds of export by name."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from nerfloom.cameras.view import View
 from nerfloom.evaluation.error_bound import limited_error, parse_error
 from nerfloom.evaluation.frames import FACTS, Frames, hash_of_file, hash_of_tensors, open_frames, write_file
 from nerfloom.evaluation.outputs import (
+    Arrays,
     chosen_outputs,
     distance_range,
     largest_distance,
@@ -28,11 +30,12 @@ from nerfloom.evaluation.outputs import (
     shown_output,
     side_by_side,
 )
-from nerfloom.evaluation.video_suffixes import MAX_GIF_FPS, check_suffix
+from nerfloom.evaluation.video_suffixes import MAX_GIF_FPS, VIDEO, check_suffix
 from nerfloom.evaluation.videos import MAX_UINT16, write_distances, write_images, write_strip, write_video
 from nerfloom.rendering.outputs import Output
 from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.loaded import Loaded
+from nerfloom.video.film import part_length, render_film
 from nerfloom.video.settings import FileSettings, PathSettings, ViewSettings
 from nerfloom.video.views import VIEWS, Views, background_of
 
@@ -75,12 +78,20 @@ def render_path(loaded: Loaded, name: str, output: Path, settings: PathSettings)
         truth = None if views.truth is None else views.truth(index)
         return rendered_outputs(model, view, background, outputs, loaded.unit, truth)
 
+    film, count = _is_film(settings, target, outputs), len(views.cameras)
+    area = int(views.cameras.widths[0]) * int(views.cameras.heights[0])
+    frames = open_frames(target, count, facts, part_length(3 * area * len(outputs)) if film else None)
     with nullcontext() if bound is None else limited_error(model, bound):
-        frames = open_frames(target, len(views.cameras), facts)
-        frames.render(render)
+        if film:
+            render_film(frames, render, partial(_picture, names=[each.name for each in outputs]), target, views.fps)
+        else:
+            frames.render(render)
     if bound is not None:
         say(f"--max-error: rays ended where the rest could change a colour by at most {bound:.2g}")
-    _write(settings, frames, target, views, facts, outputs, loaded.scale.unit or "units of the input")
+    if film:
+        say(f"{count} frames ({', '.join(each.name for each in outputs)}): {target}")
+    else:
+        _write(settings, frames, target, views, facts, outputs, loaded.scale.unit or "units of the input")
     frames.remove()
 
 
@@ -139,6 +150,19 @@ def _check_folder(folder: Path, facts: dict[str, Any]) -> None:
         )
 
 
+def _is_film(settings: PathSettings, output: Path, outputs: Sequence[Output]) -> bool:
+    """Return whether the render is one video without numbers: their colours depend on all frames."""
+    is_one = len(outputs) == 1 or not settings.apart
+    return output.suffix.lower() == VIDEO and is_one and not any(output.kind in NUMBERS for output in outputs)
+
+
+def _picture(
+    kept: Arrays, names: Sequence[str], ranges: Mapping[str, tuple[float, float]] = MappingProxyType({})
+) -> np.ndarray:
+    """Return the picture (H, W', 3) of the outputs `names` of a frame, side by side; `ranges` as in `shown_output`."""
+    return side_by_side([shown_output(kept, name, ranges) for name in names])
+
+
 # -- files --------------------------------------------------------------------------------------------------------
 
 
@@ -167,7 +191,7 @@ def _write(
     }
     apart = settings.shows_images and is_folder if settings.apart is None else settings.apart
     for group in [[name] for name in names] if apart else [names] if names else []:
-        pictures = (side_by_side([shown_output(kept, name, ranges) for name in group]) for kept in frames)
+        pictures = map(partial(_picture, names=group, ranges=ranges), frames)
         shown = track(pictures, "Writing", total=frames.count)
         if is_folder:
             folder = output / group[0] if apart else output

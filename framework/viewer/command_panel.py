@@ -82,4 +82,4 @@ class CommandPanel:
             self._note.content = f"Cannot read {plain(file.name)}: {error.strerror or error}"
             return
         self._client.send_file_download(file.name, content, save_immediately=True)
-        self._note.content = f"Sent {plain(file.name)}; it is also kept with the run."
+        self._note.content = f"Sent {plain(file.name)}; it is also kept where the viewer runs."

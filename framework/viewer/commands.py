@@ -1,4 +1,4 @@
-"""Commands that browsers start: one at a time, each in a process of its own."""
+"""Commands that browsers start on what is shown: one at a time, each in a process of its own."""
 
 from __future__ import annotations
 
@@ -18,9 +18,14 @@ Tell = Callable[[str, "int | None"], None]
 
 
 class Commands:
-    """The command that a browser has started, if any."""
+    """The command that a browser has started, if any.
 
-    def __init__(self) -> None:
+    Args:
+        opens: words of the command line with which a command opens the run or file that is shown, in the same frame.
+    """
+
+    def __init__(self, opens: Sequence[str]) -> None:
+        self.opens = opens
         self._process: subprocess.Popen[str] | None = None
         self._is_closed = False
         self._lock = threading.Lock()

@@ -27,7 +27,7 @@ COLOR = (0, 160, 255)
 ARROW = 70.0
 """Length of an arrow, pixels."""
 FILE = "crop.yaml"
-"""Name of the region's file in a run's folder."""
+"""Name of the region's file in the folder of a run or a file."""
 Face = tuple[int, int]
 """Axis of a face's normal, and 0 for the face of the minimum corner or 1 for the maximum corner."""
 FACES: tuple[Face, ...] = tuple(product(range(3), range(2)))
@@ -62,7 +62,9 @@ class CropPanel:
             hint = "Distance from the camera, scene units."
             self._near = gui.add_number("Near", 0.0, min=0.0, step=step, hint=hint)
             self._far = gui.add_number("Far", round(float(model.scene.far), 3), min=0.0, step=step, hint=hint)
-            gui.add_button("Save the box", hint=f"{FILE} in the folder of the run.").on_click(lambda _: self._save())
+            gui.add_button("Save the box", hint=f"{FILE} in the folder of the run or file.").on_click(
+                lambda _: self._save()
+            )
             self._note = gui.add_markdown("")
         for handle in (self._cropping, self._boxed):
             handle.on_update(self._switched)
@@ -158,7 +160,7 @@ class CropPanel:
         return None if crop is None else crop.box.moved(*self._loaded().placement.original_similarity())
 
     def _save(self) -> None:
-        """Write the box to the run's folder."""
+        """Write the box to the folder of the run or file."""
         region, file = self.region(), self._loaded().folder / FILE
         if region is None:
             self._note.content = "There is no box: the crop is off, or a lowest coordinate is not below the highest."

@@ -8,9 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from nerfloom.export.kinds import KINDS
+from nerfloom.export.kinds import KINDS, kinds_of
 from nerfloom.geometry.regions import write_region
-from nerfloom.splats.gaussians import HasGaussians
 from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.command_panel import CommandPanel
 from nerfloom.viewer.commands import Commands
@@ -22,9 +21,9 @@ if TYPE_CHECKING:
     import viser
 
 FOLDER = "exports"
-"""Folder of exports in the folder of a run."""
-CHOICES = {f"{name} {suffix}": (name, suffix) for name, kind in KINDS.items() for suffix in kind.suffixes}
-"""Kinds of exports and the suffixes of their files, by their name in the list."""
+"""Folder of exports in the folder of a run or a file."""
+PREFERRED = "gaussian-splat", "pointcloud", "web"
+"""Kinds of exports from the most to the least wanted. The first that suits is chosen when the panel opens."""
 
 
 class ExportPanel:
@@ -46,25 +45,27 @@ class ExportPanel:
         crop: CropPanel,
         commands: Commands,
     ) -> None:
-        self._loaded, self._request, self._crop = loaded, request, crop
-        gui = client.gui
-        gui.add_markdown(f"Exports the inside of the crop box, at the time shown, into the folder {FOLDER} of the run.")
-        first = "gaussian-splat .ply" if isinstance(loaded().model, HasGaussians) else "pointcloud .ply"
-        self._kind = gui.add_dropdown("What", list(CHOICES), initial_value=first)
+        self._loaded, self._request, self._crop, self._opens = loaded, request, crop, commands.opens
+        self._choices = choices(loaded())
+        gui, folder = client.gui, folder_of(loaded()).relative_to(loaded().folder).as_posix()
+        gui.add_markdown(f"Exports the inside of the crop box, at the time shown, into the folder {plain(folder)}.")
+        kinds = [name for name, _ in self._choices.values()]
+        first = kinds.index(next(name for name in PREFERRED if name in kinds))
+        self._kind = gui.add_dropdown("What", list(self._choices), initial_value=list(self._choices)[first])
         gui.add_button("Export").on_click(lambda _: self._export())
         self._note = gui.add_markdown("")
         self._command = CommandPanel(client, commands)
 
     def _export(self) -> None:
         """Start ns-export in another process."""
-        name, suffix = CHOICES[one_of(self._kind.value, list(CHOICES))]
+        name, suffix = self._choices[one_of(self._kind.value, list(self._choices))]
         region = self._crop.region()
         if region is not None and not KINDS[name].is_cropped:
             self._note.content = f"{name} takes no crop: switch the crop off."
             return
         self._note.content = ""
-        folder = self._loaded().folder / FOLDER
-        words = [name, self._loaded().origin, "--output-dir", folder, *self._flags(name, suffix)]
+        folder = folder_of(self._loaded())
+        words: list[object] = [name, "--output-dir", folder, *self._flags(name, suffix)]
         try:
             # Not in the run's folder: another browser may save its box there before the process has read this one.
             with TemporaryDirectory(prefix="nerfloom-") as temporary:
@@ -72,23 +73,31 @@ class ExportPanel:
                     file = Path(temporary) / FILE
                     write_region(file, region)
                     words += ["--region", file]
-                self._command.run("nerfloom.cli.export", words, lambda: newest(folder, suffix))
+                self._command.run("nerfloom.cli.export", [*words, *self._opens], lambda: newest(folder, suffix))
         except OSError as error:
             self._note.content = f"Cannot export: {plain(error.strerror or str(error))}."
 
     def _flags(self, name: str, suffix: str) -> list[object]:
-        """Return the flags of ns-export for a kind of export, a suffix, and the picture's time and crop."""
-        loaded, kind, request = self._loaded(), KINDS[name], self._request()
-        flags: list[object] = ["--device-type", loaded.model.device.type]
-        data = loaded.run.config.data
-        if data is not None and data.exists():  # without its photographs, a run can still export what needs none
-            flags += ["--data", data]
+        """Return the flags of ns-export for a kind of export, a suffix, and the picture's time."""
+        kind, request = KINDS[name], self._request()
+        flags = list[object]()
         if len(kind.suffixes) > 1:
             flags += ["--format", suffix.removeprefix(".")]
         has_time = any(field.name == "time" for field in dataclasses.fields(kind.settings))
         if has_time and request is not None and request.time is not None:
             flags += ["--time", request.time]
         return flags
+
+
+def choices(loaded: Loaded) -> dict[str, tuple[str, str]]:
+    """Return the kinds of exports that suit a run or a file, and the suffixes of their files, by name in the list."""
+    return {f"{name} {end}": (name, end) for name, kind in kinds_of(loaded).items() for end in kind.suffixes}
+
+
+def folder_of(loaded: Loaded) -> Path:
+    """Return the folder of the exports of a run or a file. Exports of other files have the same names."""
+    together = loaded.folder / FOLDER
+    return together if loaded.is_run else together / loaded.origin.stem
 
 
 def newest(folder: Path, suffix: str) -> Path:

@@ -50,12 +50,14 @@ class Page:
         server: the server.
         queue: draws the pictures.
         photos: the training images.
-        may_start: whether browsers may start ns-render and ns-export.
+        commands: the commands that browsers start, ns-render and ns-export; None if they may not.
     """
 
-    def __init__(self, server: viser.ViserServer, queue: RenderQueue, photos: Photographs, may_start: bool) -> None:
+    def __init__(
+        self, server: viser.ViserServer, queue: RenderQueue, photos: Photographs, commands: Commands | None
+    ) -> None:
         self._server, self._queue, self._photographs = server, queue, photos
-        self._commands = Commands() if may_start else None
+        self._commands = commands
         self._panels: dict[int, list[Any]] = {}
         self._curve: Any = None
         self._heading = server.gui.add_markdown("")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +41,7 @@ class PathPanel:
         loaded: function that returns the model and its run.
         request: function that returns the browser's request; None if its camera is invalid.
         move: moves the browser's camera.
-        commands: the commands of all browsers; None if rendering is not allowed.
+        commands: the commands of all browsers; None if they may start none.
     """
 
     def __init__(
@@ -53,6 +53,7 @@ class PathPanel:
         commands: Commands | None,
     ) -> None:
         self._client, self._loaded, self._request, self._move = client, loaded, request, move
+        self._commands = commands
         self._editor = Editor()
         self._playing = False
         gui = client.gui
@@ -72,8 +73,9 @@ class PathPanel:
         gui.add_button("Save").on_click(lambda _: self._save())
         self._note = gui.add_markdown("")
         if commands is not None:
-            gui.add_button("Save and render").on_click(lambda _: self._render())
-            self._command = CommandPanel(client, commands)
+            button = gui.add_button("Save and render")
+            command, opens = CommandPanel(client, commands), commands.opens
+            button.on_click(lambda _: self._render(command, opens))
 
     def close(self) -> None:
         """Stop the preview when the browser has left."""
@@ -177,19 +179,19 @@ class PathPanel:
         except OSError as error:
             self._note.content = f"Cannot write {file.name}: {error.strerror or error}"
             return None
-        words = map(shlex.quote, (str(self._loaded().origin), "--camera-path-filename", str(file)))
-        command = f"ns-render camera-path {' '.join(words)}"
-        say(f"viewer: saved {file}; render it with: {command} --output-path {default_video(file.stem)}")
+        opens = [str(self._loaded().origin)] if self._commands is None else self._commands.opens
+        words = ["--camera-path-filename", str(file), "--output-path", str(default_video(file.stem)), *opens]
+        say(f"viewer: saved {file}; render it with: ns-render camera-path {shlex.join(words)}")
         self._note.content = f"Saved {file.name}, {len(path)} frames."
         return file
 
-    def _render(self) -> None:
-        """Start ns-render on the path in another process."""
+    def _render(self, command: CommandPanel, opens: Sequence[str]) -> None:
+        """Start ns-render on the path, of what the words `opens` name, in another process."""
         file = self._save()
         if file is not None:
             output = file.with_name(default_video(file.stem).name)
-            words = [self._loaded().origin, "--camera-path-filename", file, "--output-path", output]
-            self._command.run("nerfloom.cli.render", ["camera-path", *words], lambda: output)
+            words = ["camera-path", "--camera-path-filename", file, "--output-path", output, *opens]
+            command.run("nerfloom.cli.render", words, lambda: output)
 
 
 def _or_zero(value: Any) -> int:

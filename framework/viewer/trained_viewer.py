@@ -12,6 +12,7 @@ from nerfloom.training.checkpoint import FOLDER, list_checkpoints
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.trained import load_parameters
 from nerfloom.viewer.beside import check_beside
+from nerfloom.viewer.commands import Commands
 from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.render_queue import RenderQueue
@@ -22,7 +23,13 @@ SECONDS_PER_LOOK = 2.0
 
 
 def view_loaded(
-    loaded: Loaded, host: str, port: int, follow: bool, second: Loaded | None = None, quick: Loaded | None = None
+    loaded: Loaded,
+    host: str,
+    port: int,
+    commands: Commands,
+    follow: bool,
+    second: Loaded | None = None,
+    quick: Loaded | None = None,
 ) -> None:
     """Serve a run, a file of Gaussians or an octree to browsers until Ctrl-C.
 
@@ -30,6 +37,7 @@ def view_loaded(
         loaded: the run or file.
         host: interface to listen on.
         port: port to listen on; the next free one if it is taken.
+        commands: the commands that browsers start.
         follow: whether to show newer checkpoints of the run as they are written.
         second: a second run or file of the same data, which is shown beside the first; None for none.
         quick: a faster file of the same scene, which is drawn while the camera moves, not beside a second; None for
@@ -47,7 +55,7 @@ def view_loaded(
     ndc = photographs.ndc if loaded.model.scene.warped else None
     queue = RenderQueue(loaded, ndc=ndc, truth=photographs.truth, second=second, quick=quick)
     server = open_server(host, port, "nerfloom")
-    page = Page(server, queue, photographs, may_start=follow)
+    page = Page(server, queue, photographs, commands)
     say("Ctrl-C ends it")
     seen, looked = loaded.checkpoint, time.monotonic()
     try:

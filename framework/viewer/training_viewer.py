@@ -121,7 +121,7 @@ def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
     queue = RenderQueue(in_training(run, trainer), PIECE_SECONDS, PIECE_SECONDS, ndc, photographs.truth)
     turns = Turns(trainer, queue, config.viewer_share)
     server = open_server(config.viewer.websocket_host, config.viewer.websocket_port, "nerfloom")
-    page = Page(server, queue, photographs, may_start=False)
+    page = Page(server, queue, photographs, commands=None)
     status = Status(server, page, trainer, turns)
 
     def between_steps(report: StepReport, stopped: Sequence[int]) -> None:

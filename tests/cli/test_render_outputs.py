@@ -194,11 +194,13 @@ def test_the_true_image_and_the_error(ball_run: Path, shared_tiny: Path, tmp_pat
 
 
 @pytest.mark.medium
+@pytest.mark.parametrize("outputs", [("rgb", "depth"), ("rgb",)])
 def test_a_killed_render_goes_on_to_the_same_file(
-    ball_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    outputs: tuple[str, ...], ball_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Colours of depths are those of all frames; a video of colours alone is encoded meanwhile."""
     ending = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
-    words = ("orbit", ball_run, "--num-frames", 6, "--rendered-output-names", "rgb", "depth")
+    words = ("orbit", ball_run, "--num-frames", 6, "--rendered-output-names", *outputs)
     whole, parts = tmp_path / f"whole{ending}", tmp_path / f"parts{ending}"
     assert called("ns-render", *words, "--output-path", whole).returncode == 0
     rendered: list[int] = []

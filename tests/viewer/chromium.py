@@ -39,6 +39,12 @@ def between(start: Place, end: Place, steps: int) -> list[Place]:
     return [(x0 + (x1 - x0) * k / steps, y0 + (y1 - y0) * k / steps) for k in range(1, steps + 1)]
 
 
+def _twice() -> tuple[float, float]:
+    """Two times that have just passed, seconds since the epoch."""
+    now = time.time()
+    return now - 0.1, now
+
+
 class Tab:
     """A page in the browser."""
 
@@ -92,11 +98,17 @@ class Tab:
         self.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
         self.mouse("mouseReleased", x, y, button="left", buttons=0, clickCount=1)
 
+    def pause(self, seconds: float = 1.0) -> None:
+        """Wait for a time by the page's own clock, and for two frames: timers that end before have ended."""
+        frames = "requestAnimationFrame(() => requestAnimationFrame(done))"
+        self.evaluate(f"new Promise((done) => setTimeout(() => {frames}, {1000 * seconds}))")
+
     def key(self, key: str, code: str, number: int, held: float = 0.0) -> None:
-        """Press a key, and hold it for some seconds."""
+        """Press a key, and hold it for some seconds of the page's own time."""
         for kind, pause in (("keyDown", held), ("keyUp", 0.0)):
             self.send("Input.dispatchKeyEvent", type=kind, key=key, code=code, windowsVirtualKeyCode=number)
-            time.sleep(pause)
+            if pause:
+                self.pause(pause)
 
     def swipe(self, *fingers: tuple[Place, Place], steps: int = 8) -> None:
         """Draw fingers over the page, each from its start to its end."""
@@ -108,9 +120,18 @@ class Tab:
             time.sleep(0.03)
         self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
-    def tap(self, x: float, y: float) -> None:
-        """Touch the page with one finger."""
-        self.swipe(((x, y), (x, y)), steps=0)
+    def double_click(self, x: float, y: float) -> None:
+        """Click twice, a tenth of a second apart by the time of the events, however busy the machine is."""
+        for count, at in enumerate(_twice(), 1):
+            self.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=count, timestamp=at)
+            self.mouse("mouseReleased", x, y, button="left", buttons=0, clickCount=count, timestamp=at)
+
+    def double_tap(self, x: float, y: float) -> None:
+        """Touch the page twice with one finger, as `double_click` does."""
+        for at in _twice():
+            points = [{"x": x, "y": y}]
+            self.send("Input.dispatchTouchEvent", type="touchStart", touchPoints=points, timestamp=at)
+            self.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[], timestamp=at)
 
     def resize(self, width: int, height: int, is_phone: bool = False) -> None:
         """Change the size of the page, pixels, and whether it is on a phone, which has fingers and no mouse."""

@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -41,10 +41,12 @@ def started(*words: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 def settled(tab: Tab, seconds: float = 180.0, least: float = 5.0) -> np.ndarray:
     """The page when it has stopped changing, and its grey levels deviate by more than `least`: it is not empty."""
-    end, before = time.monotonic() + seconds, tab.screenshot()
+    end, before, rest = time.monotonic() + seconds, tab.screenshot(), 1.5
     while time.monotonic() < end:
-        time.sleep(1.5)
+        time.sleep(rest)
+        start = time.monotonic()
         now = tab.screenshot()
+        rest = max(rest, 3 * (time.monotonic() - start))  # a busy machine needs longer for a picture, too
         if np.array_equal(now, before) and now[150:500, 50:500].std() > least:
             return now
         before = now
@@ -65,6 +67,25 @@ def text_of(tab: Tab) -> str:
 def shown(tab: Tab) -> np.ndarray:
     """The picture at rest."""
     return settled(tab)[PICTURE].astype(float)
+
+
+def shown_like(tab: Tab, picture: np.ndarray, above: float = 30.0) -> np.ndarray:
+    """The picture at rest, when it is like another: before, an earlier or a coarse one may rest for a while."""
+    return _shown_when(tab, picture, lambda level: level > above)
+
+
+def shown_unlike(tab: Tab, picture: np.ndarray, below: float = 25.0) -> np.ndarray:
+    """The picture at rest, when it is unlike another; below 60 dB, when it is not the same."""
+    return _shown_when(tab, picture, lambda level: level < below)
+
+
+def _shown_when(tab: Tab, picture: np.ndarray, is_so: Callable[[float], bool], seconds: float = 180.0) -> np.ndarray:
+    end = time.monotonic() + seconds
+    while True:
+        found = shown(tab)
+        if is_so(level := decibels(found, picture)):
+            return found
+        assert time.monotonic() < end, f"the picture rests at {level:.2f} dB"
 
 
 def expected(
@@ -111,7 +132,7 @@ def choose(tab: Tab, label: str, option: str) -> None:
       return [box.x + box.width / 2, box.y + box.height / 2];
     }})()"""
     tab.click(*tab.evaluate(script))
-    time.sleep(0.5)
+    tab.pause(0.5)
     tab.press(option)
 
 
@@ -138,13 +159,13 @@ def type_text(tab: Tab, label: str, text: str) -> None:
     """Replace the text beside a label."""
     _type_beside(tab, label, "input", "input", text)
     tab.key("Enter", "Enter", 13)
-    time.sleep(1)
+    tab.pause()
 
 
 def type_number(tab: Tab, label: str, text: str) -> None:
     """Replace the number beside a slider."""
     _type_beside(tab, label, "[role=slider]", "input:not([type=hidden])", text)
-    time.sleep(1)
+    tab.pause()
 
 
 def _type_beside(tab: Tab, label: str, part: str, field: str, text: str) -> None:
@@ -171,7 +192,7 @@ def tick(tab: Tab, label: str) -> None:
     }})()"""
     places = [[], tab.evaluate(script)]
     while places[-2] != places[-1]:
-        time.sleep(0.3)
+        tab.pause(0.3)
         places.append(tab.evaluate(script))
     tab.click(*places[-1])
 

@@ -1,5 +1,6 @@
 """Commands that browsers start: their output, their progress and their end."""
 
+import json
 import os
 import sys
 import threading
@@ -10,12 +11,16 @@ from typing import Any, cast
 
 import pytest
 
-from nerfloom.export.kinds import KINDS
+from nerfloom.base.errors import ConfigError
+from nerfloom.export.kinds import KINDS, export
 from nerfloom.geometry.regions import Box, Region, read_region
-from nerfloom.viewer import commands
+from nerfloom.training.load import load
+from nerfloom.viewer import commands, trained_viewer
 from nerfloom.viewer.command_panel import CommandPanel
 from nerfloom.viewer.commands import Commands, follow
-from nerfloom.viewer.export_panel import CHOICES, ExportPanel, newest
+from nerfloom.viewer.export_panel import ExportPanel, choices, folder_of, newest
+from tests.cli.helpers import called
+from tests.edit.clouds import ball_in_capture
 from tests.patience import until
 
 PRINTS = """
@@ -46,7 +51,7 @@ def _scripts(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("status", [0, 3])
 def test_what_a_command_prints(status: int, capsys: pytest.CaptureFixture[str]) -> None:
     told: list[tuple[str, int | None]] = []
-    process = Commands().start(PRINTS, [status])
+    process = Commands([]).start(PRINTS, [status])
     assert process is not None
     assert follow(process, lambda line, percent: told.append((line, percent))) == status
     assert told == [
@@ -64,14 +69,14 @@ def test_progress_comes_as_lines_whatever_the_terminal_is_said_to_be(
     variable: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(variable, "1")
-    told, process = list[str](), Commands().start(IS_A_TERMINAL, [])
+    told, process = list[str](), Commands([]).start(IS_A_TERMINAL, [])
     assert process is not None
     assert follow(process, lambda line, _: told.append(line)) == 0
     assert told == ["False"]
 
 
 def test_there_is_one_at_a_time_and_it_can_be_stopped(tmp_path: Path) -> None:
-    running, told, ended = Commands(), list[str](), list[int]()
+    running, told, ended = Commands([]), list[str](), list[int]()
 
     def run(file: Path) -> threading.Thread:
         told.clear()
@@ -124,7 +129,7 @@ class Screen:
 
 
 def test_a_second_press_leaves_the_progress_of_the_first(tmp_path: Path) -> None:
-    running, screen, file = Commands(), Screen(), tmp_path / "splat.ply"
+    running, screen, file = Commands([]), Screen(), tmp_path / "splat.ply"
     file.write_bytes(b"ply")
     panel = CommandPanel(cast(Any, screen), running)
     first = threading.Thread(target=lambda: panel.run(WAITS, [tmp_path / "end"], lambda: file))
@@ -143,7 +148,7 @@ def test_a_file_is_sent_once(tmp_path: Path) -> None:
     """Each download holds the file in memory until the browser has read it."""
     screen, file = Screen(), tmp_path / "splat.ply"
     file.write_bytes(b"ply")
-    panel = CommandPanel(cast(Any, screen), Commands())
+    panel = CommandPanel(cast(Any, screen), Commands([]))
     screen.press(None)  # before there is any
     panel.run(PRINTS, [0], lambda: file)
     for _ in range(3):
@@ -153,26 +158,25 @@ def test_a_file_is_sent_once(tmp_path: Path) -> None:
 
 
 def test_an_export_has_a_crop_file_of_its_own(tmp_path: Path) -> None:
-    """The files saved in the run's folder stay as they are. Data that has moved is not asked for."""
+    """The files saved in the run's folder stay as they are."""
     boxes, screen = [Box((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0)), Box((0.0, 0.0, 0.0), (3.0, 3.0, 3.0))], Screen()
     read, files = list[Region](), list[Path]()
 
     def start(module: str, words: list[Any]) -> None:
-        flags = dict(zip(words[2::2], words[3::2], strict=True))
-        assert "--data" not in flags
+        assert words[-2:] == opens
+        flags = dict(zip(words[1:-2:2], words[2:-2:2], strict=True))
         files.append(flags["--region"])
         read.append(read_region(files[-1]))
 
-    source = SimpleNamespace(config=SimpleNamespace(data=tmp_path / "gone"))
-    model = SimpleNamespace(device=SimpleNamespace(type="cpu"))
-    loaded = SimpleNamespace(model=model, folder=tmp_path, origin=tmp_path, run=source)
+    opens = ["--load-config=run", "--data=elsewhere"]
+    loaded = SimpleNamespace(model=SimpleNamespace(), folder=tmp_path, is_run=True, source=object())
     left = boxes.copy()
     given: list[Any] = [
         screen,
         lambda: loaded,
         lambda: None,
         SimpleNamespace(region=lambda: left.pop(0)),
-        SimpleNamespace(start=start),
+        SimpleNamespace(start=start, opens=opens),
     ]
     panel = ExportPanel(*given)
     panel._export()
@@ -182,9 +186,54 @@ def test_an_export_has_a_crop_file_of_its_own(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_kind_and_format_is_offered() -> None:
-    assert {name for name, _ in CHOICES.values()} == set(KINDS)
-    assert "gaussian-splat .spz" in CHOICES
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Gaussians in the frame of a capture beside them."""
+    ball_in_capture(tmp_path)
+    return tmp_path / "ball.ply"
+
+
+@pytest.mark.parametrize("words", [(), ("--data", "capture", "nerfstudio", "--eval-interval", 3)])
+def test_what_a_file_can_be_exported_as_is_offered(scene: Path, words: tuple[object, ...], tmp_path: Path) -> None:
+    """Each export that is not offered would be refused for what the file lacks."""
+    loaded = load(scene, data=tmp_path / "capture" if words else None)
+    found = {name for name, _ in choices(loaded).values()}
+    known = {"pointcloud", "tsdf", "cameras"} if words else set()
+    assert found == {"gaussian-splat", "levels", "web"} | known
+    assert {end for name, end in choices(loaded).values() if name == "gaussian-splat"} == {
+        ".ply",
+        ".spz",
+        ".sog",
+        ".glb",
+    }
+    for name in set(KINDS) - found:
+        kind = KINDS[name]
+        with pytest.raises(ConfigError, match=r"--data|has no"):
+            export(loaded, name, tmp_path / f"a{kind.suffixes[0]}", kind.settings())
+    assert folder_of(loaded) == tmp_path / "exports" / "ball"
+
+
+def test_commands_open_what_the_viewer_shows(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands take the flags that opened a file, and those of its data format, after flags of their own."""
+    given: list[Any] = []
+    monkeypatch.setattr(trained_viewer, "view_loaded", lambda *words: given.append(words))
+    words = ("ball.ply", "--data", "capture", "--websocket-port", 17999, "nerfstudio", "--eval-interval", 3)
+    shown = called("ns-viewer", *words, "--device-type", "cpu", folder=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    loaded, commands = given[0][0], given[0][3]
+    assert commands.opens == [
+        *("--load-config=ball.ply", "--data=capture", "--device-type=cpu"),
+        *("nerfstudio", "--eval-interval=3"),
+    ]
+    done = called("ns-export", "cameras", "--output-dir", "exports", *commands.opens, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "exports" / "transforms_train.json").read_text())
+    monkeypatch.chdir(tmp_path)
+    assert len(content) == len(loaded.parsed("train").image_paths) == 6  # all but every third of nine
+    path = ("--camera-path-filename", "no.json", "--output-path", "a.gif")
+    assert "no.json" in called("ns-render", "camera-path", *path, *commands.opens, folder=tmp_path).stderr
+    assert called("ns-viewer", "ball.ply", "--up=-y", folder=tmp_path).returncode == 0
+    assert given[1][3].opens == ["--load-config=ball.ply", "--up=-y"]
 
 
 def test_the_newest_file_is_offered(tmp_path: Path) -> None:

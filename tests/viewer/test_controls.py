@@ -1,7 +1,6 @@
 """The viewer's other controls in headless Chromium: what each changes in the picture, in a file or in the page."""
 
 import math
-import time
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -25,6 +24,8 @@ from tests.viewer.pages import (
     pixel_of,
     settled,
     shown,
+    shown_like,
+    shown_unlike,
     started,
     text_of,
     tick,
@@ -47,25 +48,24 @@ def test_resolution_background_cells_and_curve(browser: Chromium, run: Path) -> 
         fine = expected(run, tab, look)
 
         choose(tab, "Resolution", "256")
-        coarse = shown(tab)
+        coarse = shown_unlike(tab, first, 60)
         small = expected(run, tab, look, longest=256)
         choose(tab, "Resolution", "1024")
         assert decibels(coarse, small) > 30
         assert decibels(coarse, small) > decibels(coarse, fine) + 2
-        assert decibels(shown(tab), first) > 40
+        shown_like(tab, first, 40)
 
         tab.press("Background")
         tick(tab, "Own colour")
         type_text(tab, "Colour", "rgb(0, 160, 0)")
-        green = shown(tab)
+        shown_like(tab, expected(run, tab, look, background=(0.0, 160 / 255, 0.0)))
         tick(tab, "Own colour")
-        assert decibels(green, expected(run, tab, look, background=(0.0, 160 / 255, 0.0))) > 30
-        assert decibels(shown(tab), first) > 40
+        shown_like(tab, first, 40)
 
         tick(tab, "Occupied cells")
-        cells = np.abs(shown(tab) - first).max(-1) > 40
+        cells = np.abs(shown_unlike(tab, first, 60) - first).max(-1) > 40
         tick(tab, "Occupied cells")
-        assert decibels(shown(tab), first) > 40
+        shown_like(tab, first, 40)
         print(f"cells cover {cells.mean():.2f} of the picture")
         assert cells.mean() > 0.1
 
@@ -84,39 +84,51 @@ def test_photographs(browser: Chromium, run: Path) -> None:
     middle = (poses[camera, :, 3] - 0.5 * poses[camera, :, 2]).tolist()
     with started(command("ns-viewer"), run, "--websocket-port", 18607) as (_, address):
         tab = browser.open(address)
-        shown(tab)
+        colors = shown(tab)
         choose(tab, "Output", "depth")  # a photograph would not hide in it
+        shown_unlike(tab, colors)
         first = settled(tab)[:, 320:560].astype(int)
         tab.press("Photos")
         tick(tab, "Show cameras")
         until(lambda: "10 of 10 cameras" in text_of(tab))
-        covered = np.abs(settled(tab)[:, 320:560] - first).max(-1) > 40
+
+        def covers() -> np.ndarray:
+            return np.abs(settled(tab)[:, 320:560] - first).max(-1) > 40
+
+        until(lambda: covers().sum() > 100)
+        covered = covers()
         print(f"the other cameras cover {covered.mean():.3f} of the picture")
         assert 100 < covered.sum() < 0.3 * covered.size  # the camera where the page stands would cover all
         place, _ = pixel_of(tab, look, middle)
         tab.mouse("mouseMoved", *place)
-        time.sleep(1)
+        tab.pause()
         tab.click(*place)
         until(lambda: "photograph 5: r_5.png" in text_of(tab))
         tick(tab, "Show cameras")
         tab.press("View")
         choose(tab, "Output", "rgb")
-        assert decibels(shown(tab), expected(run, tab, look_of(run, camera), fov=PHOTOGRAPH_FOV)) > 30
+        shown_like(tab, expected(run, tab, look_of(run, camera), fov=PHOTOGRAPH_FOV))
         tab.press("Photos")
         for letter, index in (("n", 6), ("p", 5), ("p", 4)):
             tab.key(letter, f"Key{letter.upper()}", ord(letter.upper()))
             until(lambda index=index: f"photograph {index}: r_{index}.png" in text_of(tab))
-        assert decibels(shown(tab), expected(run, tab, look_of(run, 4), fov=PHOTOGRAPH_FOV)) > 30
+        shown_like(tab, expected(run, tab, look_of(run, 4), fov=PHOTOGRAPH_FOV))
         tab.close()
+
+
+WATCH = """new MutationObserver(() => {
+  if (document.body.innerText.includes("Stop")) window.stoppable = true;
+}).observe(document.body, { subtree: true, childList: true, characterData: true })"""
+"""Notices the button *Stop*, which is there for three seconds."""
 
 
 def go_to_photograph(tab: Tab, index: int) -> None:
     tab.press("Photos")
     type_into(tab, "Photograph", 0, str(index))
-    time.sleep(1)  # the page sends a number a moment after it was typed
+    tab.pause()  # the page sends a number a moment after it was typed
     tab.press("Go to the photograph")
     until(lambda: f"photograph {index}: " in text_of(tab))
-    time.sleep(1)
+    tab.pause()
     tab.press("Path")
 
 
@@ -134,7 +146,7 @@ def test_path(browser: Chromium, run: Path) -> None:
             until(lambda count=count: f"{count} camera" in text_of(tab))
         choose(tab, "Camera", "1")
         tab.press("go to")
-        assert decibels(shown(tab), expected(run, tab, look_of(run), fov=PHOTOGRAPH_FOV)) > 30
+        shown_like(tab, expected(run, tab, look_of(run), fov=PHOTOGRAPH_FOV))
         go_to_photograph(tab, 8)
         tab.press("move here")
         choose(tab, "Camera", "2")
@@ -150,11 +162,13 @@ def test_path(browser: Chromium, run: Path) -> None:
         file = run / "camera_path-myloop.json"
         until(file.is_file)
         before = shown(tab)
+        tab.evaluate(WATCH)
         tab.press("Preview")
-        until(lambda: "Stop" in text_of(tab))
+        until(lambda: tab.evaluate("window.stoppable"))
+        until(lambda: "Preview" in text_of(tab))  # it has come to its end
+        type_number(tab, "Seconds between", "20")
+        tab.press("Preview")
         until(lambda: decibels(tab.screenshot()[PICTURE].astype(float), before) < 25)
-        until(lambda: "Preview" in text_of(tab))
-        tab.press("Preview")
         tab.press("Stop")
         until(lambda: "Preview" in text_of(tab))
         tab.close()
@@ -167,9 +181,9 @@ def test_path(browser: Chromium, run: Path) -> None:
         assert keyframe.fov == pytest.approx(PHOTOGRAPH_FOV, abs=1e-3)
 
 
-def matter(tab: Tab) -> tuple[float, float, float]:
+def matter(picture: np.ndarray) -> tuple[float, float, float]:
     """Column and row of the middle of the ball, and its area, pixels."""
-    rows, columns = (np.abs(shown(tab) - 255).max(-1) > 40).nonzero()
+    rows, columns = (np.abs(picture - 255).max(-1) > 40).nonzero()
     return float(columns.mean()), float(rows.mean()), float(len(rows))
 
 
@@ -177,24 +191,29 @@ def test_the_mouse_and_the_keys_move_the_camera(browser: Chromium, run: Path) ->
     """The ball moves against the camera, and its area grows as the camera comes closer."""
     with started(command("ns-viewer"), run, "--websocket-port", 18807) as (_, address):
         tab = browser.open(address)
-        shown(tab)
+        first = shown(tab)
         type_number(tab, "Field of view", "90")
-        column, row, area = matter(tab)
+        wide = shown_unlike(tab, first, 60)
+        column, row, area = matter(wide)
         tab.drag((300, 300), (350, 330), button="right")
-        x, y, _ = matter(tab)
+        panned = shown_unlike(tab, wide, 60)
+        x, y, _ = matter(panned)
         assert 30 < x - column < 70
         assert 15 < y - row < 45
         tab.drag((350, 330), (300, 300), button="right")
+        start = shown_unlike(tab, panned, 60)
         tab.mouse("mouseWheel", 450, 300, deltaX=0, deltaY=-200)
-        assert matter(tab)[2] > 1.1 * area
+        closer = shown_unlike(tab, start, 60)
+        assert matter(closer)[2] > 1.1 * area
         tab.mouse("mouseWheel", 450, 300, deltaX=0, deltaY=200)
+        start = shown_unlike(tab, closer, 60)
         for forth, back, axis, sign in (("w", "s", 2, 1), ("a", "d", 0, 1), ("e", "q", 1, 1)):
-            before = matter(tab)
+            before = matter(start)
             for letter, way in ((forth, sign), (back, -sign)):
-                start = matter(tab)
                 tab.key(letter, f"Key{letter.upper()}", ord(letter.upper()), held=0.3)
-                moved = matter(tab)[axis] - start[axis]
-                print(f"{letter}: from {start} by {moved:.1f}")
+                end = shown_unlike(tab, start, 60)
+                moved, start = matter(end)[axis] - matter(start)[axis], end
+                print(f"{letter}: by {moved:.1f}")
                 assert way * moved > (0.02 * before[2] if axis == 2 else 2)
         tab.close()
 
@@ -212,11 +231,11 @@ def test_appearance(browser: Chromium, tmp_path: Path) -> None:
     light = []
     with started(command("ns-viewer"), trainer.folder, "--websocket-port", 18907) as (_, address):
         tab = browser.open(address)
-        shown(tab)
+        picture = shown(tab)
         for index in (0, 1):
             type_number(tab, "Appearance", str(index))
-            ball = shown(tab)[66:146, 350:430]
-            light.append(ball.mean())
+            picture = shown_unlike(tab, picture, 60)
+            light.append(picture[66:146, 350:430].mean())
         tab.close()
     print(f"light of the ball as in the first photograph {light[0]:.0f}, as in the second {light[1]:.0f}")
     assert light[1] < 0.7 * light[0]

@@ -2,7 +2,6 @@
 
 import json
 import re
-import time
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -20,7 +19,7 @@ from tests.cli.helpers import TINY_NGP, command
 from tests.conftest import write_tiny
 from tests.patience import until
 from tests.training.helpers import tiny_trainer
-from tests.viewer.chromium import Chromium
+from tests.viewer.chromium import Chromium, Tab
 from tests.viewer.pages import (
     PICTURE,
     choose,
@@ -30,6 +29,8 @@ from tests.viewer.pages import (
     meets_box,
     settled,
     shown,
+    shown_like,
+    shown_unlike,
     size_of,
     started,
     text_of,
@@ -46,26 +47,24 @@ pytestmark = pytest.mark.slow
 def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
     with started(command("ns-viewer"), run, "--websocket-port", 17107) as (process, address):
         tab = browser.open(address)
-        first = shown(tab)
-        found = decibels(first, expected(run, tab, look_of(run)))
-        print(f"the page's picture against the model's: {found:.1f} dB")
-        assert found > 30
+        shown(tab)
+        first = shown_like(tab, expected(run, tab, look_of(run)))
 
         tab.drag((300, 400), (420, 380))
-        assert decibels(shown(tab), first) < 25  # the mouse has moved the camera
+        shown_unlike(tab, first)  # the mouse has moved the camera
 
         before = shown(tab)
         choose(tab, "Output", "depth")
-        assert decibels(shown(tab), before) < 20
+        shown_unlike(tab, before, 20)
         choose(tab, "Output", "rgb")
-        assert decibels(shown(tab), before) > 40
+        shown_like(tab, before, 40)
 
         tab.press("Path")
         tab.press("Add this camera")
         tab.drag((300, 400), (420, 380))
-        time.sleep(1)
+        tab.pause()
         tab.press("Add this camera")
-        time.sleep(1)
+        tab.pause()
         tab.press("Save")
         file = run / "camera_path.json"
         until(file.is_file)
@@ -85,6 +84,11 @@ def test_a_trained_run(browser: Chromium, run: Path, tmp_path: Path) -> None:
         assert process.poll() is None
 
 
+def share_of_matter(tab: Tab) -> float:
+    """The share of the picture at rest that is not the white background."""
+    return float((np.abs(settled(tab, least=-1)[PICTURE].astype(int) - 255).max(-1) > 40).mean())
+
+
 def test_crop(browser: Chromium, run: Path) -> None:
     """The outside of the box is gone from the page, and the inside is unchanged; so is what is too near or too far."""
     with started(command("ns-viewer"), run, "--websocket-port", 17407) as (_, address):
@@ -94,34 +98,37 @@ def test_crop(browser: Chromium, run: Path) -> None:
         tick(tab, "Crop")
         tick(tab, "Show the box")  # its lines would count as matter
         type_into(tab, "Highest corner", 2, "0")  # the upper half of the ball is cut away
-        time.sleep(1)
-        cut = shown(tab)
+        tab.pause()
+        cut = shown_unlike(tab, whole, 60)
+        matter, left = (np.abs(picture - 255).max(-1) > 40 for picture in (whole, cut))  # the background is white
         low, high = load_trained(run, device_type="cpu").model.scene.box.double().tolist()
         inside = meets_box(tab, look_of(run), low, [*high[:2], 0.0])
         type_into(tab, "Lowest corner", 2, "-0.001")
-        time.sleep(1)
-        slice_left = (np.abs(settled(tab, least=-1)[PICTURE].astype(int) - 255).max(-1) > 40).mean()
+        tab.pause()
+        until(lambda: share_of_matter(tab) < 0.2 * left.mean())  # a thin slice
         type_into(tab, "Lowest corner", 2, str(low[2]))
-        depths_left, away = [], float(np.linalg.norm(look_of(run)[:3]))
-        for near, far in ((0, 0.7), (1.3, 3), (0, 3)):  # the ball is between 0.75 and 1.25 of the camera's distance
+        away = float(np.linalg.norm(look_of(run)[:3]))
+        # The ball is between 0.75 and 1.25 of the camera's distance.
+        for near, far, least, most in ((0, 0.7, 0, 0.01), (1.3, 3, 0, 0.01), (0, 3, 0.95, 1.05)):
             type_into(tab, "Near", 0, f"{near * away:.2f}")
             type_into(tab, "Far", 0, f"{far * away:.2f}")
-            time.sleep(1)
-            depths_left.append((np.abs(settled(tab, least=-1)[PICTURE].astype(int) - 255).max(-1) > 40).mean())
+            tab.pause()
+            share = left.mean() if least else 1.0
+            until(lambda share=share, least=least, most=most: least <= share_of_matter(tab) / share <= most)
         tab.close()
     # JPEG's blocks of 8 pixels carry errors across the edge of the box.
     near_edge = binary_dilation(inside, iterations=9) & ~binary_erosion(inside, iterations=9)
     outside, inside = ~inside & ~near_edge, inside & ~near_edge
-    matter, left = (np.abs(picture - 255).max(-1) > 40 for picture in (whole, cut))  # the background is white
     print(f"matter outside of the box: {matter[outside].mean():.3f} before, {left[outside].mean():.5f} after")
     print(f"matter inside: {matter[inside].mean():.3f} before, {left[inside].mean():.3f} after")
     assert matter[outside].mean() > 0.1
     assert left[outside].mean() == 0
     assert left[inside].mean() > 0.1
-    print(f"left of a thin slice: {slice_left:.4f} of {left.mean():.3f}, by depths: {depths_left}")
-    assert slice_left < 0.2 * left.mean()
-    assert max(depths_left[:2]) < 0.01
-    assert depths_left[2] == pytest.approx(left.mean(), rel=0.05)
+
+
+def line_pixels(tab: Tab) -> int:
+    """How many pixels of the page have the colour of the line between two points."""
+    return int((np.abs(tab.screenshot()[PICTURE].astype(int) - [255, 190, 0]).max(-1) < 60).sum())
 
 
 def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
@@ -139,10 +146,10 @@ def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
         tab.click(*places[1])
         length = r"(\d+\.\d+) (± \d|\(error unknown)"  # two cameras may not agree on so coarse a ball
         found = until(lambda: re.search(length, text_of(tab)))
-        time.sleep(1)
-        picture = tab.screenshot(tmp_path / "measure.png")
+        until(lambda: line_pixels(tab) > 100)
+        tab.screenshot(tmp_path / "measure.png")
         tab.press("Set the scale")
-        time.sleep(1)
+        tab.pause()
         type_into(tab, "True length", 0, "20")
         type_text(tab, "Unit", "cm")
         tab.press("Set scale")
@@ -166,24 +173,26 @@ def test_measuring(browser: Chromium, run: Path, tmp_path: Path) -> None:
     assert float(found[1]) == pytest.approx(expected.value, rel=0.02)  # the page's pixels are not the window's
     assert scale["unit"] == "cm"
     assert scale["factor"] == pytest.approx(20 / expected.value, rel=0.02)
-    assert int((np.abs(picture[PICTURE].astype(int) - [255, 190, 0]).max(-1) < 60).sum()) > 100  # the line is drawn
 
 
 @pytest.fixture
 def blue_with_time(tmp_path: Path) -> Path:
-    """A K-Planes run of a ball with blue that grows from none to full while the camera circles."""
+    """A K-Planes run of a ball with blue that grows from none to full while the camera circles seven times.
+
+    After one circle, blue might belong to the side of the ball instead of the time.
+    """
     data = write_tiny(tmp_path / "ball", counts=(20, 2, 2))
     for split in ("train", "val", "test"):
         file = data / f"transforms_{split}.json"
         content = json.loads(file.read_text())
         for index, frame in enumerate(content["frames"]):
-            frame["time"] = index / (len(content["frames"]) - 1)
+            frame["time"] = 7 * index % len(content["frames"]) / (len(content["frames"]) - 1)
             picture = data / f"{frame['file_path']}.png"
             rgba = iio.imread(picture)
             rgba[..., 2] = (rgba[..., 3] * frame["time"]).astype(np.uint8)
             iio.imwrite(picture, rgba)
         file.write_text(json.dumps(content))
-    trainer = tiny_trainer("kplanes", data, tmp_path / "run", max_num_iterations=200)
+    trainer = tiny_trainer("kplanes", data, tmp_path / "run", max_num_iterations=400)
     trainer.train()
     return trainer.folder
 
@@ -192,11 +201,12 @@ def test_time(browser: Chromium, blue_with_time: Path) -> None:
     run = blue_with_time
     with started(command("ns-viewer"), run, "--websocket-port", 17307) as (_, address):
         tab = browser.open(address)
-        assert decibels(shown(tab), expected(run, tab, look_of(run), 0.0)) > 30
+        shown(tab)
+        early = expected(run, tab, look_of(run), 0.0)
+        shown_like(tab, early)
         to_the_end(tab)
-        late = shown(tab)
-        assert decibels(late, expected(run, tab, look_of(run), 1.0)) > 30
-        assert decibels(late, expected(run, tab, look_of(run), 0.0)) < 28  # the learnt scene changes with time
+        late = shown_like(tab, expected(run, tab, look_of(run), 1.0))
+        assert decibels(late, early) < 28  # the learnt scene changes with time
         tab.close()
 
 
@@ -213,10 +223,16 @@ def test_a_run_in_training(browser: Chromium, shared_tiny: Path, tmp_path: Path)
         until(lambda: tab.screenshot()[PICTURE].std() > 5)
         before = until(step)
         until(lambda: step() > before)
+
+        def rests() -> bool:
+            now = step()
+            tab.pause(2)
+            return step() == now
+
         tab.press("Pause training")
-        time.sleep(2)
+        until(rests)  # the page may be some steps behind
         paused = step()
-        time.sleep(2)
+        tab.pause(2)
         assert step() == paused
         tab.press("Continue training")
         until(lambda: step() > paused)

@@ -51,7 +51,7 @@ class Served:
         self.folder, self.data, self.model = folder, data, trainer.model
         self._server = open_server("127.0.0.1", 17007, "test")
         self.port = self._server.get_port()
-        self.page = Page(self._server, self.queue, self.photographs, may_start=False)
+        self.page = Page(self._server, self.queue, self.photographs, commands=None)
         self._ending = False
         self._thread = threading.Thread(target=self._draw)
         self._thread.start()

@@ -29,6 +29,7 @@ def looking(number: int, pictures: list[np.ndarray], queue: RenderQueue, x: floa
 
 
 @pytest.mark.medium
+@pytest.mark.usefixtures("even_clock")  # on a busy machine one picture might take the share of all steps
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_bits_with_and_without(kind: str, shared_tiny: Path, tmp_path: Path) -> None:
     plain = tiny_trainer(kind, shared_tiny, tmp_path / "plain", max_num_iterations=STEPS)

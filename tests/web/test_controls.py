@@ -1,7 +1,6 @@
 """Each control of the web page in headless Chromium, from disk: a real mouse, real keys and real fingers on it."""
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -238,9 +237,7 @@ def test_each_drag_of_the_mouse(live: Chromium, pages: dict[str, str]) -> None:
 
     press(tab, "reset")
     blue, _ = blob(tab, BLUE)
-    for count in (1, 2):
-        tab.mouse("mousePressed", *blue, button="left", buttons=1, clickCount=count)
-        tab.mouse("mouseReleased", *blue, button="left", buttons=0, clickCount=count)
+    tab.double_click(*blue)
     np.testing.assert_allclose(blob(tab, BLUE)[0], MIDDLE, atol=2)
 
     press(tab, "reset")
@@ -354,8 +351,7 @@ def test_a_phone_and_its_fingers(live: Chromium, pages: dict[str, str]) -> None:
 
     press(tab, "reset")
     blue, _ = blob(tab, BLUE)
-    tab.tap(*blue)
-    tab.tap(*blue)
+    tab.double_tap(*blue)
     np.testing.assert_allclose(blob(tab, BLUE)[0], middle, atol=2)
 
     press(tab, "ask")
@@ -366,6 +362,6 @@ def test_a_phone_and_its_fingers(live: Chromium, pages: dict[str, str]) -> None:
     press(tab, "motion")
     until(lambda: tab.evaluate("document.getElementById('motion').ariaPressed") == "true")
     tab.resize(*PHONE[::-1], is_phone=True)
-    time.sleep(0.5)
+    tab.pause(0.5)
     assert_apart(tab, *PHONE[::-1])
     tab.close()

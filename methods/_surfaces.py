@@ -34,10 +34,9 @@ from nerfloom.losses.surfaces import (
     Eikonal,
     HiddenSpace,
     Silhouette,
-    SurfaceColorError,
     SurfacePoints,
 )
-from nerfloom.losses.terms import KNOWN_DISTANCES, SamplerLoss
+from nerfloom.losses.terms import KNOWN_DISTANCES, ColorError, SamplerLoss
 from nerfloom.methods._captures import RefinedConfig, RefinedModel, refinement_choice
 from nerfloom.methods._grids import finest_cells, table_of_surface
 from nerfloom.renderable import parts
@@ -112,7 +111,7 @@ class SurfaceConfig(
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
-    GONE: ClassVar[dict[str, Any]] = {"sharpness_learning_rate": SHARPNESS_RATE}
+    GONE: ClassVar[dict[str, Any]] = {"sharpness_learning_rate": SHARPNESS_RATE, "color_loss": "squared"}
     """Settings of earlier versions."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the papers' networks, of 8 layers for the distance and 4 for
@@ -130,9 +129,6 @@ class SurfaceConfig(
     """Number of frequencies in the encoding of positions (frequency)."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions (frequency)."""
-    color_loss: Auto[Literal["squared", "absolute"]] = AUTO
-    """Error of colours. absolute: as in NeuS and VolSDF; edges and highlights that are still wrong count less, so that
-    surfaces form where there is little texture. auto: absolute if there is a background, otherwise squared."""
     eikonal_loss_mult: Auto[float] = AUTO
     """Weight of the term that keeps the distance's gradient at length 1. auto: 0.01 if there is a background, otherwise
     0.003."""
@@ -198,10 +194,8 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
         Choice("curvature_from", 0.5 if captured else 0.0, reason),
         Choice("curvature_until", 1.0 if captured else 0.4, reason),
     )
-    error, start = ("absolute", 0.5) if captured else ("squared", 0.25)
-    color = Choice("color_loss", error, reason, "error of colours")
-    radius = Choice("start_radius", start, reason, "radius of the first ball")
-    config, own = fill(config, color, radius, refinement_choice(scene, marched=False))
+    radius = Choice("start_radius", 0.5 if captured else 0.25, reason, "radius of the first ball")
+    config, own = fill(config, radius, refinement_choice(scene, marched=False))
     return config, made + samples + (cells if on_grid else []) + own
 
 
@@ -299,7 +293,7 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
 
     step_scale: Tensor
     losses = (
-        SurfaceColorError(),
+        ColorError(),
         SamplerLoss(),
         Silhouette(),
         Eikonal(),

@@ -12,9 +12,8 @@ from nerfloom.fields.surface import SurfaceField
 from nerfloom.geometry.bounds import intersect_box
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.math import safe_normalize
-from nerfloom.losses.functions import charbonnier, mean_squared_error
+from nerfloom.losses.functions import mean_squared_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
-from nerfloom.losses.terms import ColorError
 from nerfloom.renderable import parts
 from nerfloom.samplers.cells import places
 from nerfloom.samplers.occupancy import OccupancySampler
@@ -34,18 +33,6 @@ TRIED = 1024
 """Number of random positions in the box for `HiddenSpace`."""
 BEHIND = 0.03
 """Thickness of space behind points of a reconstruction that counts as solid, in halves of the box's shortest edge."""
-ABSOLUTE = 0.1
-"""Factor of the absolute error of colours. The absolute error is about ten times the squared error, so the weights of
-the other terms suit both."""
-
-
-class SurfaceColorError(ColorError):
-    """Squared or absolute error of colours: the setting `color_loss`."""
-
-    def error(self, rgb: Tensor, shown: RenderedBatch) -> Tensor:
-        if shown.model.config.color_loss == "squared":
-            return super().error(rgb, shown)
-        return ABSOLUTE * charbonnier(rgb, shown.batch.rgb, shown.batch.weights)
 
 
 class Eikonal(LossTerm):

@@ -57,7 +57,7 @@ def join_videos(path: Path, parts: Sequence[Path], seconds: Sequence[float]) -> 
     Raises:
         ConfigError: if the file cannot be written.
     """
-    import imageio_ffmpeg
+    import imageio_ffmpeg  # type: ignore[import-untyped]
 
     listed = parts[0].with_name("parts.txt")
     with _whole(path) as temporary:

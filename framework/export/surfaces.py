@@ -56,8 +56,9 @@ def found_surfaces(
     """
     # instant-ngp's settings and rates suit a few seconds; nerfacto's do not (docs/notes/splatting.md).
     limit = None if dataset.scene.unbounded or seconds == math.inf else seconds
+    usual: Any = method.config
     settings = replace(
-        method.config,
+        usual,
         max_num_iterations=steps,
         max_seconds=limit,
         machine=config.machine,

@@ -102,8 +102,6 @@ class SurfaceConfig(
         "bounds_loss_mult": AT_LEAST_0,
         "hidden_loss_mult": AT_LEAST_0,
         "curvature_loss_mult": AT_LEAST_0,
-        "curvature_from": (0, 1),
-        "curvature_until": (0, 1),
         "start_radius": (1e-3, 1),
         "start_sharpness": (1e-3, 1e6),
         "sharpen_until": (0, 1),
@@ -111,7 +109,12 @@ class SurfaceConfig(
         "open_levels_until": (0, 1),
     }
     """Allowed range of each numeric setting."""
-    GONE: ClassVar[dict[str, Any]] = {"sharpness_learning_rate": SHARPNESS_RATE, "color_loss": "squared"}
+    GONE: ClassVar[dict[str, Any]] = {
+        "sharpness_learning_rate": SHARPNESS_RATE,
+        "color_loss": "squared",
+        "curvature_from": 0.0,
+        "curvature_until": 0.4,
+    }
     """Settings of earlier versions."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the papers' networks, of 8 layers for the distance and 4 for
@@ -129,9 +132,8 @@ class SurfaceConfig(
     """Number of frequencies in the encoding of positions (frequency)."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions (frequency)."""
-    eikonal_loss_mult: Auto[float] = AUTO
-    """Weight of the term that keeps the distance's gradient at length 1. auto: 0.01 if there is a background, otherwise
-    0.003."""
+    eikonal_loss_mult: float = 0.003
+    """Weight of the term that keeps the distance's gradient at length 1."""
     silhouette_loss_mult: float = 0.01
     """Weight of the difference between opacity and the images' alpha."""
     points_loss_mult: float = 0.1
@@ -142,13 +144,7 @@ class SurfaceConfig(
     """Weight of positive distances where images look but no training ray arrives, below a floor or inside of things.
     Only with a background on a sphere, and with an occupancy grid."""
     curvature_loss_mult: float = 0.002
-    """Weight of the change of normals along the surface."""
-    curvature_from: Auto[float] = AUTO
-    """Fraction of the budget until --curvature-loss-mult applies. auto: 0.5 if there is a background, where the first
-    shape has to retreat before, otherwise 0."""
-    curvature_until: Auto[float] = AUTO
-    """Fraction of the budget after which --curvature-loss-mult does not apply any more: details come last. auto: 1 if
-    there is a background, otherwise 0.4."""
+    """Weight of the change of normals along the surface, in the first 40 % of the budget: details come last."""
     start_radius: Auto[float] = AUTO
     """Radius of the ball that training starts from, in halves of the box's shortest edge. auto: 0.5 if there is a
     background, otherwise 0.25."""
@@ -158,9 +154,9 @@ class SurfaceConfig(
     """Length of a training step in widths of the surface, limited to one to four steps of --num-steps. 0: one step."""
     eval_rendering: Literal["volume", "surface"] = "volume"
     """Rendering of pictures. volume: as in training; surface: the colour where a ray first meets the surface."""
-    sharpen_until: Auto[float] = AUTO
+    sharpen_until: float = 0.3
     """Fraction of the budget until the upper bound of the inverse width has risen, exponentially, to 50 times the first
-    value. auto: 0.8 if there is a background, otherwise 0.3."""
+    value."""
     open_levels_until: float = 0.3
     """Fraction of the budget until all levels of the hash grid are open, from coarse to fine (hash-grid)."""
 
@@ -187,13 +183,6 @@ def decide_surface(config: SurfaceConfigT, scene: Scene) -> tuple[SurfaceConfigT
     config, _ = fill(config, table_of_surface(config.max_resolution))
     captured = config.background_model == "sphere"
     reason = "a background could explain what has no texture" if captured else "nothing is behind the surfaces"
-    config, _ = fill(
-        config,
-        Choice("sharpen_until", 0.8 if captured else 0.3, reason),
-        Choice("eikonal_loss_mult", 0.01 if captured else 0.003, reason),
-        Choice("curvature_from", 0.5 if captured else 0.0, reason),
-        Choice("curvature_until", 1.0 if captured else 0.4, reason),
-    )
     radius = Choice("start_radius", 0.5 if captured else 0.25, reason, "radius of the first ball")
     config, own = fill(config, radius, refinement_choice(scene, marched=False))
     return config, made + samples + (cells if on_grid else []) + own

@@ -31,6 +31,8 @@ SMALLEST_CHANGE = 1e-3
 
 TRIED = 1024
 """Number of random positions in the box for `HiddenSpace`."""
+SMOOTH_UNTIL = 0.4
+"""Fraction of the training budget with the curvature term. Later it removes details (docs/notes/surfaces.md)."""
 BEHIND = 0.03
 """Thickness of space behind points of a reconstruction that counts as solid, in halves of the box's shortest edge."""
 
@@ -97,7 +99,7 @@ class Curvature(LossTerm):
 
     Some samples are compared with a position one sample's length away, in a random direction along the level set. The
     term is the mean difference of the two unit normals, so that edges count less than noise everywhere. It applies
-    from the fraction `curvature_from` of the training budget to the fraction `curvature_until`.
+    during the first part `SMOOTH_UNTIL` of the training budget.
     """
 
     def __init__(self) -> None:
@@ -106,9 +108,7 @@ class Curvature(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
         assert isinstance(field, SurfaceField)
-        config = shown.model.config
-        applies = config.curvature_from <= field.progress <= config.curvature_until
-        if not applies or samples is None or samples.features is None or not len(samples):
+        if field.progress > SMOOTH_UNTIL or samples is None or samples.features is None or not len(samples):
             return None
         some = some_of(len(samples), BENT)
         normals = safe_normalize(samples.features[some, :3])

@@ -400,7 +400,7 @@ def test_captures_get_a_background_on_a_sphere(name: str, shared_tiny: Path, tmp
     trainer = captured(tmp_path, {"unbounded": True, "has_alpha": False}, max_num_iterations=3)
     assert chosen(trainer)["background model"] == "sphere"
     assert isinstance(trainer.model.renderer, SphereRenderer)
-    assert chosen(trainer)["error of colours"] == "absolute"
+    assert chosen(trainer)["radius of the first ball"] == "0.5"
     trainer.train()
     assert trainer.state.skipped == 0
 

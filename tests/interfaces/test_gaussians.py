@@ -32,27 +32,37 @@ MOVING = dataclasses.replace(SCENE, moving=True)
 FEW: dict[str, Any] = {"start": "random", "num_gaussians": 600, "start_gaussians": 400, "steps_per_move": 20}
 
 
-def learner(name: str, **changes: Any) -> Learner:
+def learner(name: str, seed: int = 0, **changes: Any) -> Learner:
     """A method on a ball that rises by 2 * RISE from time 0 to 1, seen from all around."""
     method = load_method(name)
-    return Learner(method, dataclasses.replace(method.config, **FEW, **changes), moving_ball(), 0)
+    return Learner(method, dataclasses.replace(method.config, **FEW, **changes), moving_ball(), seed)
 
 
 @pytest.mark.medium
 def test_velocities_are_those_of_the_ball_and_make_pictures_sharper() -> None:
-    """The mean velocity of visible Gaussians is compared with the path of the ball; the error, with still Gaussians."""
-    moving, still = learner("drift", rate_factor=8.0), learner("gaussian-splatting", rate_factor=8.0)
+    """The mean velocity of visible Gaussians is compared with the path of the ball; the error, with still Gaussians.
+
+    The velocity is the mean of two seeds, because 400 random places leave a chance of 0.03 in each coordinate.
+    """
+    moving, still = (
+        [learner("drift", seed, rate_factor=8.0) for seed in (0, 1)],
+        learner("gaussian-splatting", rate_factor=8.0),
+    )
     for _ in range(200):
-        moving.step()
-        still.step()
-    model = moving.model
+        for found in (*moving, still):
+            found.step()
+    velocity = torch.stack([mean_velocity(found.model) for found in moving]).mean(0)
+    print(velocity, moving[0].error(), still.error())
+    torch.testing.assert_close(velocity, torch.tensor([0.0, 0.0, 2 * RISE]), atol=0.2 * (2 * RISE), rtol=0)
+    assert moving[0].error() < 0.2 * still.error()  # 7 dB
+
+
+def mean_velocity(model: object) -> torch.Tensor:
+    """The mean velocity (3,) of Gaussians, by what they cover."""
     assert isinstance(model, Drift)
     start, end = model.gaussians(0.0), model.gaussians(1.0)
     weights = torch.sigmoid(start.logits)[:, None] * start.log_scales.exp().mean(1, keepdim=True).square()
-    velocity = (weights * (end.means - start.means)).sum(0) / weights.sum()
-    print(velocity, moving.error(), still.error())
-    torch.testing.assert_close(velocity, torch.tensor([0.0, 0.0, 2 * RISE]), atol=0.2 * (2 * RISE), rtol=0)
-    assert moving.error() < 0.2 * still.error()  # 7 dB
+    return (weights * (end.means - start.means)).sum(0) / weights.sum()
 
 
 def test_all_columns_go_through_growth_moves_and_checkpoints() -> None:

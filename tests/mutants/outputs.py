@@ -175,7 +175,7 @@ MUTANTS = {
         Mutant("masked-windows-of-finest-scale", "windows_of_scales", "A == 1", "A > 0",
             "coarse pixels that are partly of ignored ones count as perfect in SSIM at five scales",
             "evaluation/test_metrics.py::test_at_five_scales_windows_with_ignored_pixels_do_not_count"),
-        Mutant("psnr-of-log", "psnr", "A * error.log10()", "A * error.log2() / 3",
+        Mutant("psnr-of-log", "psnr_of_error", "A * B.log10()", "A * B.log2() / 3",
             "PSNR is 10 % off",
             "evaluation/test_metrics.py::test_black_against_black_is_alike"),
         Mutant("ssim-window", "ssim", "2 * 1.5 ** 2", "1.5 ** 2",

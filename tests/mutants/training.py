@@ -55,15 +55,17 @@ MUTANTS = {
             "short runs get tables for long ones",
             "truth/test_training.py::test_longer_runs_of_instant_ngp_get_larger_tables"),
     ],
+    "nerfloom.encodings.planes": [
+        Mutant("kplanes-scales", "resolutions_of", "A << scale", "A",
+            "all scales are the coarsest",
+            "stress/test_losses_metrics.py::test_regularisers_of_planes_in_space_and_time"),
+    ],
     "nerfloom.methods.kplanes": [
         Mutant("kplanes-time-smoothness", "PlaneRegularity.of", "0", "1",
             "space is smoothed where time should be",
             "stress/test_losses_metrics.py::test_regularisers_of_planes_in_space_and_time"),
         Mutant("kplanes-time-pulled-to-zero", "PlaneRegularity.of", "1 - A", "A",
             "planes of time are pulled to 0, which makes the scene vanish",
-            "stress/test_losses_metrics.py::test_regularisers_of_planes_in_space_and_time"),
-        Mutant("kplanes-scales", "make_field", "A << scale", "A",
-            "all scales are the coarsest",
             "stress/test_losses_metrics.py::test_regularisers_of_planes_in_space_and_time"),
     ],
     "nerfloom.ray_model": [

@@ -14,7 +14,7 @@ import torch
 from nerfloom.cameras.view import View
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.request import Pose, Request
-from tests.patience import PATIENCE
+from tests.patience import PATIENCE, until
 from tests.viewer.chromium import Tab
 
 PICTURE = np.s_[200:520, 60:540]
@@ -61,7 +61,7 @@ def size_of(tab: Tab) -> tuple[int, int]:
 
 def text_of(tab: Tab) -> str:
     """The words of the page."""
-    return str(tab.evaluate("document.body.innerText"))
+    return str(tab.evaluate("document.body?.innerText ?? ''"))
 
 
 def shown(tab: Tab) -> np.ndarray:
@@ -194,7 +194,11 @@ def tick(tab: Tab, label: str) -> None:
     while places[-2] != places[-1]:
         tab.pause(0.3)
         places.append(tab.evaluate(script))
+    box = f"""document.getElementById([...document.querySelectorAll("label")]
+      .find(e => e.textContent.trim() === {json.dumps(label)}).htmlFor).checked"""
+    before = tab.evaluate(box)
     tab.click(*places[-1])
+    until(lambda: tab.evaluate(box) != before)
 
 
 def pixel_of(tab: Tab, camera: list[float], point: Sequence[float]) -> tuple[np.ndarray, float]:

@@ -34,6 +34,7 @@ from tests.viewer.pages import (
     tick,
     type_into,
     type_number,
+    type_text,
 )
 
 pytest.importorskip("viser", reason="the extra [viewer] is not installed")
@@ -235,6 +236,8 @@ def test_a_video_has_a_bar_and_is_downloaded(browser: Chromium, run: Path) -> No
         tab.pause()
         tab.press("Add this camera")
         tab.pause()
+        type_text(tab, "Width", "320")
+        type_text(tab, "Height", "180")
         tab.press("Save and render")
         until(lambda: tab.evaluate("document.querySelector('[role=progressbar]') !== null"))
         until(lambda: "Wrote camera" in text_of(tab))

@@ -351,6 +351,7 @@ def test_what_the_page_cannot_be(splats: Path, tmp_path: Path, refused: Refused)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("even_clock")  # the fit has seconds, and a busy machine learns less in them
 def test_a_field_gets_gaussians_that_look_like_it(
     shared_tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,6 +35,7 @@ from nerfloom.renderable import RendersRays
 from nerfloom.splats.drawing import DRAWN
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians
 from nerfloom.splats.learning import number_for, rate_factor
+from nerfloom.splats.look import OURS
 from nerfloom.splats.start import on_surfaces
 from nerfloom.training.progress import take_all
 from nerfloom.training.trainer import Trainer
@@ -72,6 +73,7 @@ SETTINGS: dict[str, Any] = {
     "appearance": "none",
     "camera_optimizer": "off",
     "robust": "off",
+    "blur": OURS.blur,  # pages and files of fitted Gaussians have this look
     "depth_loss_mult": 0.0,
     "field_depth_mult": 0.0,
     "background": "black",  # `FieldPictures` chooses it

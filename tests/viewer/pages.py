@@ -156,10 +156,15 @@ def type_into(tab: Tab, label: str, index: int, text: str) -> None:
 
 
 def type_text(tab: Tab, label: str, text: str) -> None:
-    """Replace the text beside a label."""
-    _type_beside(tab, label, "input", "input", text)
-    tab.key("Enter", "Enter", 13)
-    tab.pause()
+    """Replace the text beside a label, again if the page has just drawn the field anew and kept the old one."""
+
+    def typed() -> bool:
+        _type_beside(tab, label, "input", "input", text)
+        tab.key("Enter", "Enter", 13)
+        tab.pause()
+        return bool(tab.evaluate(_field_beside(label, "input", "input") + ".value") == text)
+
+    until(typed)
 
 
 def type_number(tab: Tab, label: str, text: str) -> None:
@@ -168,12 +173,19 @@ def type_number(tab: Tab, label: str, text: str) -> None:
     tab.pause()
 
 
-def _type_beside(tab: Tab, label: str, part: str, field: str, text: str) -> None:
-    """Replace the text of a field in the row of a label; the row is the label's nearest ancestor with a part."""
-    script = f"""(() => {{
+def _field_beside(label: str, part: str, field: str) -> str:
+    """Script that finds a field in the row of a label; the row is the label's nearest ancestor with a part."""
+    return f"""(() => {{
       let row = [...document.querySelectorAll("label")].filter(e => e.textContent.trim() === {json.dumps(label)})[0];
       while (!row.querySelector({json.dumps(part)})) row = row.parentElement;
-      const field = row.querySelector({json.dumps(field)});
+      return row.querySelector({json.dumps(field)});
+    }})()"""
+
+
+def _type_beside(tab: Tab, label: str, part: str, field: str, text: str) -> None:
+    """Replace the text of a field beside a label (`_field_beside`)."""
+    script = f"""(() => {{
+      const field = {_field_beside(label, part, field)};
       field.scrollIntoView({{block: "center"}});
       field.focus();
       field.select();

@@ -100,7 +100,7 @@ def test_what_ends_the_head_lets_the_job_save_and_the_same_call_goes_on(number: 
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, Callable[[], None]]]:
     """The address of a running cluster, and a function that kills its head: Ray's gcs_server and raylet."""
-    monkeypatch.setenv("RAY_raylet_start_wait_time_s", str(PATIENCE))
+    monkeypatch.setenv("RAY_raylet_start_wait_time_s", str(int(PATIENCE)))  # Ray crashes on "600.0"
     monkeypatch.setenv("RAY_gcs_rpc_server_reconnect_timeout_s", "2")  # otherwise commands wait for the head for 60 s
     folder = tempfile.mkdtemp(prefix="ray")  # paths of Ray's sockets must be short
     with socket.create_server(("127.0.0.1", 0)) as free:

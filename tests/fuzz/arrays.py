@@ -85,7 +85,7 @@ def entry(random: Random, content: bytes) -> bytes:
         return random.choice(RAW)(random, content)
     name = random.choice(sorted(entries))
     what = random.random()
-    if what < 0.2:
+    if what < 0.2 and len(entries) > 1:
         entries[random.choice(sorted(entries))] = entries.pop(name)
     elif what < 0.5:
         entries[name] = other_numbers(random, entries[name])

@@ -71,7 +71,7 @@ def read_flags(kind: Any, prog: str, arguments: list[str], takes: str = "", **op
 
 
 def words_of(settings: Any, kind: type[Any]) -> list[str]:
-    """Return the words from which `read_flags` reads the values of `settings` that are not the default.
+    """Return words for `read_flags` that give all values of `settings` other than the defaults.
 
     Args:
         settings: a dataclass with values that are one word each: texts, numbers, paths and truth values.

@@ -50,7 +50,7 @@ def join_videos(path: Path, parts: Sequence[Path], seconds: Sequence[float]) -> 
 
     Args:
         path: .mp4 file to write.
-        parts: .mp4 files of `write_video`, of one size and speed, in one folder, in which their list is written. They
+        parts: .mp4 files of `write_video`, of one size and speed, in one folder. Their list is written there too. They
             have at least five pictures each, or the encoder does not delay all of them by the same number of pictures.
         seconds: their exact durations; the files round them to milliseconds.
 

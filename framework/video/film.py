@@ -37,7 +37,7 @@ def render_film(
     A stopped film continues with its parts and the frames after them, and the file has the same bytes.
 
     Args:
-        frames: the frames, some of which may be there already.
+        frames: the frames; some may be there already.
         render: function that returns the arrays of a frame from its index.
         picture: function that returns the picture (H, W, 3) uint8 of a frame from its arrays.
         path: .mp4 file to write.

@@ -21,7 +21,7 @@ class Commands:
     """The command that a browser has started, if any.
 
     Args:
-        opens: words of the command line with which a command opens the run or file that is shown, in the same frame.
+        opens: words of the command line that open the run or file that is shown, in the same frame.
     """
 
     def __init__(self, opens: Sequence[str]) -> None:

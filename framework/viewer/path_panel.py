@@ -186,7 +186,7 @@ class PathPanel:
         return file
 
     def _render(self, command: CommandPanel, opens: Sequence[str]) -> None:
-        """Start ns-render on the path, of what the words `opens` name, in another process."""
+        """Start ns-render on the path in another process; the words `opens` name the scene."""
         file = self._save()
         if file is not None:
             output = file.with_name(default_video(file.stem).name)

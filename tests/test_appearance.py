@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from nerfloom.data.image_files import read_image
 from nerfloom.data.light_spread import APPEARANCE_STOPS, MAX_PIXELS, light_of, light_spread
+from nerfloom.testing.ball import cameras_at
 
 
 def scene(seed: int, shape: tuple[int, int] = (90, 120)) -> np.ndarray:
@@ -22,8 +24,15 @@ def stored(linear: np.ndarray) -> np.ndarray:
     return (srgb * 255).round().astype(np.uint8)
 
 
+def around(count: int) -> Tensor:
+    """Poses of cameras on a circle that look at its centre."""
+    angles = torch.linspace(0, 5, count)
+    return cameras_at(3 * torch.stack([angles.cos(), angles.sin(), 0 * angles], -1), 40.0, 8).camera_to_worlds
+
+
 def spread(images: list[np.ndarray]) -> float:
-    return light_spread(torch.from_numpy(np.stack([light_of(image) for image in images])))
+    light = torch.from_numpy(np.stack([light_of(image) for image in images]))
+    return light_spread(light, around(len(images)))
 
 
 def test_the_same_view_in_other_exposures_differs_by_their_standard_deviation() -> None:
@@ -79,7 +88,24 @@ def test_it_looks_at_few_pixels() -> None:
 def test_photographs_without_usable_pixels_are_passed_over() -> None:
     nothing = np.full((3, 5), np.nan, np.float32)
     light = np.stack([light_of(stored(scene(0))), nothing, light_of(stored(scene(0) * 2))])
-    assert light_spread(torch.from_numpy(light)) == pytest.approx(0.5, rel=0.1)
+    assert light_spread(torch.from_numpy(light), around(3)) == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("stops", [0.0, 0.5])
+def test_the_sides_of_a_street_are_not_changing_light(stops: float) -> None:
+    """Cameras along a road look ahead at dark trees, left at a grey wall and right at a white one."""
+    count = 60
+    yaws = torch.tensor([0.0, 90.0, -90.0]).repeat(count // 3).deg2rad()
+    poses = torch.zeros(count, 3, 4)
+    poses[:, :, 2] = -torch.stack([yaws.cos(), yaws.sin(), 0 * yaws], -1)
+    poses[:, 2, 1] = 1
+    poses[:, :, 0] = torch.linalg.cross(poses[:, :, 1], poses[:, :, 2])
+    poses[:, 0, 3] = torch.linspace(0, 30, count)
+    exposures = stops * np.random.default_rng(1).choice([-1, 1], count)
+    views = [stored(scene(0) * 2.0 ** ([-2, 0, 1.5][index % 3] + exposures[index])) for index in range(count)]
+    light = torch.from_numpy(np.stack([light_of(view) for view in views]))
+    assert light_spread(light, poses) == pytest.approx(stops, abs=0.02 + 0.3 * stops)
+    assert light_spread(light, around(count)) > 1
 
 
 CAPTURES = {

@@ -26,6 +26,8 @@ MIN_SHARE_LOOKING = 0.9
 """Fraction of the cameras that must see the common point they look at, for a scene to be enlarged."""
 Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 """Quarter turn about x, which turns +z to +y."""
+LOOKING = 0.5
+"""Minimum cosine of the angle between a camera's axis and the direction to a point that it looks at."""
 MAX_POINTS = 2000
 """Maximum number of sparse points used."""
 
@@ -213,15 +215,18 @@ def nearest_point(origins: Tensor, directions: Tensor) -> Tensor:
 
 
 def looked_at(poses: Tensor) -> Tensor | None:
-    """Return the point (3,) float64 nearest to the axes of M cameras; None if it is behind most of them.
+    """Return the point (3,) float64 nearest to the axes of M cameras; None if most of them do not look towards it.
+
+    A walk along a street has no such point: its cameras look ahead and to both sides.
 
     `poses` are (M, 3, 4) camera-to-world, with OpenGL axes.
     """
     precise = poses.double().cpu()
     origins, ahead = precise[:, :, 3], -precise[:, :, 2]
     point = nearest_point(origins, ahead)
-    is_ahead = ((point - origins) * ahead).sum(-1) > 0
-    return point if bool(point.isfinite().all()) and float(is_ahead.double().mean()) >= 0.5 else None
+    away = point - origins
+    looking = (away * ahead).sum(-1) > LOOKING * away.norm(dim=-1)
+    return point if bool(point.isfinite().all()) and float(looking.double().mean()) >= 0.5 else None
 
 
 def enlargement(poses: Tensor, spreads: Tensor) -> float:

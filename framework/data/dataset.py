@@ -307,8 +307,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         poses=parsed.poses,
         warped=isinstance(cameras, NdcCameras),
         has_depth=parsed.depth_paths is not None and decoded.mapped is None,
-        # `light` is None for an object cut out by masks: each of its sides is lit differently.
-        appearance_varies=parsed.appearance_varies or (light is not None and light_spread(light) > APPEARANCE_STOPS),
+        appearance_varies=parsed.appearance_varies or _light_differs(light, cameras),
         camera_to_worlds=cameras.camera_to_worlds,
         image_pixels=int(cameras.offsets[-1]) // len(cameras),
         num_sparse_depths=0 if sparse is None else len(sparse),
@@ -339,6 +338,11 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         normal_paths=parsed.normal_paths,
         light_paths=parsed.light_paths,
     )
+
+
+def _light_differs(light: Tensor | None, cameras: Cameras) -> bool:
+    """Return whether light changes between images. It is None for a cut-out object: each side is lit differently."""
+    return light is not None and light_spread(light, cameras.camera_to_worlds) > APPEARANCE_STOPS
 
 
 def _with_masks(

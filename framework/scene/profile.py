@@ -48,7 +48,7 @@ class SceneProfile:
             moving=dataset.scene.moving,
             transparent=transparent / total if alpha else None,
             ignored=None if kept is None else 1 - len(kept) / total,
-            light=None if dataset.light is None else light_spread(dataset.light),
+            light=None if dataset.light is None else light_spread(dataset.light, cameras.camera_to_worlds),
             camera=cameras.model,
             decisions=tuple(decisions),
             scenes=dataset.scene.num_scenes,

@@ -76,7 +76,7 @@ def share_late(space: CovisibleSpace, cameras: Cameras, near: float, far: float)
         near, far: near and far distance of the rays, scene units.
 
     Returns:
-        A fraction in [0, 1]; None if that point is behind most of the cameras, since they look apart.
+        A fraction in [0, 1]; None if the cameras look at no common point.
     """
     target = looked_at(cameras.camera_to_worlds)
     if target is None:

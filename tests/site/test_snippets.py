@@ -12,7 +12,7 @@ import torch
 from tests.site.pages import PAGES, ROOT, Block, blocks
 from tests.training.helpers import TINY
 
-EXECUTED = ("start/first-picture", "guides/video", "python/index")
+EXECUTED = ("start/first-picture", "guides/camera-paths", "python/index")
 """Pages with Python that needs a run at most. Other pages: plug-and-play in tests/plug_and_play, those below, and
 signatures, which are not programs."""
 RUN = "outputs/lego/instant-ngp/TIME"
@@ -97,7 +97,8 @@ def test_all_can_be_compiled() -> None:
 def test_pages_with_programs_are_executed() -> None:
     """Python that calls `nerfloom` or makes a METHOD is run by some test, not only compiled."""
     run_elsewhere = {
-        "plug-and-play",
+        "check-plugins",
+        "plug-and-play-loop",
         "plug-and-play-more",
         "guides/add-a-format",
         "guides/add-a-method",
@@ -105,7 +106,6 @@ def test_pages_with_programs_are_executed() -> None:
         "guides/judge-geometry",
         "guides/measure",
         "interfaces",
-        "plugins",
     }
     pages = {block.page for page in PAGES for block in blocks(page) if block.language == "python"}
     assert pages == {f"docs/{name}.md" for name in {*EXECUTED, *run_elsewhere}}

@@ -1,4 +1,4 @@
-"""docs/plug-and-play.md and the two pages after it are true: their code runs in its order, as they describe."""
+"""docs/plug-and-play.md and the three pages after it are true: their code runs in its order, as they describe."""
 
 import re
 
@@ -7,7 +7,7 @@ import torch
 
 from tests.plug_and_play.test_examples import ROOT, differences
 
-NAMES = ("plug-and-play", "plug-and-play-loop", "plug-and-play-more")
+NAMES = ("plug-and-play", "plug-and-play-loop", "plug-and-play-more", "plug-and-play-samplers")
 PAGE = "".join((ROOT / "docs" / f"{name}.md").read_text() for name in NAMES)
 
 

@@ -12,7 +12,7 @@ import torch
 from tests.site.pages import PAGES, ROOT, Block, blocks
 from tests.training.helpers import TINY
 
-EXECUTED = ("start/first-picture", "guides/camera-paths", "python/index")
+EXECUTED = ("guides/camera-paths", "python/index")
 """Pages with Python that needs a run at most. Other pages: plug-and-play in tests/plug_and_play, those below, and
 signatures, which are not programs."""
 RUN = "outputs/lego/instant-ngp/TIME"
@@ -100,6 +100,7 @@ def test_pages_with_programs_are_executed() -> None:
         "check-plugins",
         "plug-and-play-loop",
         "plug-and-play-more",
+        "plug-and-play-samplers",
         "guides/add-a-format",
         "guides/add-a-method",
         "guides/edit",

@@ -652,7 +652,7 @@ def test_a_module_without_a_docstring(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_documentation_lists_every_check() -> None:
-    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "check-plugins.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `([a-z0-9 ]+)` \| (.*) \|$", text, re.MULTILINE))
     assert list(rows) == [check.name for check in CHECKS]
     assert {name for name, row in rows.items() if row.endswith("(rays)")} == {c.name for c in CHECKS if c.rays_only}

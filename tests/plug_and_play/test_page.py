@@ -1,4 +1,4 @@
-"""docs/plug-and-play.md and the page after it are true: their code runs, in its order, with the described results."""
+"""docs/plug-and-play.md and the three pages after it are true: their code runs in its order, as they describe."""
 
 import re
 
@@ -7,11 +7,12 @@ import torch
 
 from tests.plug_and_play.test_examples import ROOT, differences
 
-PAGE = "".join((ROOT / "docs" / f"{name}.md").read_text() for name in ("plug-and-play", "plug-and-play-more"))
+NAMES = ("plug-and-play", "plug-and-play-loop", "plug-and-play-more", "plug-and-play-samplers")
+PAGE = "".join((ROOT / "docs" / f"{name}.md").read_text() for name in NAMES)
 
 
 def blocks(language: str) -> list[str]:
-    """The code of both pages in a language, at its line in their joined text."""
+    """The code of the pages in a language, at its line in their joined text."""
     found = re.finditer(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     return ["\n" * PAGE[: match.start(1)].count("\n") + match[1] for match in found]
 

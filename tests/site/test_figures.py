@@ -111,8 +111,8 @@ def test_what_stands_beside_published_results_is_in_the_figures() -> None:
     assert [number for number in ours if number not in PSNR.findall(known)] == []
 
 
-def test_captures_to_choose_by_are_those_of_the_figures() -> None:
-    table = [row for row in rows(DOCS / "guides" / "choosing.md") if len(row) == 5]
+def test_captures_after_each_budget_are_those_of_the_figures() -> None:
+    table = [row for row in rows(DOCS / "guides" / "budgets.md") if len(row) == 5]
     numbers = [number for row in table for cell in row[1:] for number in re.findall(r"\d\d\.\d\d", cell)]
     known = PSNR.findall((DOCS / "figures.md").read_text())
     assert len(numbers) >= 18

@@ -28,7 +28,8 @@ LEFT_OUT = re.compile(
 """Commands that need more than a tiny still scene: tests of their own have them."""
 SMALL = {
     "--num-frames": "2", "--resolution": "16", "--texture-size": "64", "--target-num-faces": "200",
-    "--fit-seconds": "1", "--max-images": "1", "--max-seconds": "20", "--width": "32", "--height": "18",
+    "--fit-seconds": "1", "--max-images": "1", "--max-seconds": "20", "--max-num-iterations": "2", "--width": "32",
+    "--height": "18",
 }  # fmt: skip
 """Flags with exchanged values, so that a command takes seconds."""
 ADDED = {

@@ -12,7 +12,7 @@ import torch
 from tests.site.pages import PAGES, ROOT, Block, blocks
 from tests.training.helpers import TINY
 
-EXECUTED = ("start/first-picture", "guides/video", "python/index")
+EXECUTED = ("guides/camera-paths", "python/index")
 """Pages with Python that needs a run at most. Other pages: plug-and-play in tests/plug_and_play, those below, and
 signatures, which are not programs."""
 RUN = "outputs/lego/instant-ngp/TIME"
@@ -97,15 +97,16 @@ def test_all_can_be_compiled() -> None:
 def test_pages_with_programs_are_executed() -> None:
     """Python that calls `nerfloom` or makes a METHOD is run by some test, not only compiled."""
     run_elsewhere = {
-        "plug-and-play",
+        "check-plugins",
+        "plug-and-play-loop",
         "plug-and-play-more",
+        "plug-and-play-samplers",
         "guides/add-a-format",
         "guides/add-a-method",
         "guides/edit",
         "guides/judge-geometry",
         "guides/measure",
         "interfaces",
-        "plugins",
     }
     pages = {block.page for page in PAGES for block in blocks(page) if block.language == "python"}
     assert pages == {f"docs/{name}.md" for name in {*EXECUTED, *run_elsewhere}}

@@ -46,8 +46,6 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
     changes = {}
     for key, value in values.items():
         if key in gone:
-            if value != to_plain(gone[key]):
-                raise ConfigError(f"{where}: '{key}' is {shown(value)}, but now it is always {gone[key]}; leave it out")
             continue
         if key not in names:
             name = key if isinstance(key, str) else shown(key)
@@ -57,7 +55,12 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
             changes[key] = from_plain(current, value, f"{where}: {key}")
         else:
             changes[key] = converted(value, hints[key], f"{where}: '{key}'")
-    return dataclasses.replace(default, **changes)  # type: ignore[type-var]
+    config = dataclasses.replace(default, **changes)  # type: ignore[type-var]
+    for key in (key for key in values if key in gone):
+        now = gone[key](config) if callable(gone[key]) else gone[key]
+        if values[key] != to_plain(now):
+            raise ConfigError(f"{where}: '{key}' is {shown(values[key])}, but now it is {now}; leave it out")
+    return config
 
 
 def converted(value: Any, hint: Any, where: str) -> Any:

@@ -38,11 +38,11 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
 
     Raises:
         ConfigError: for an unknown key, with the nearest valid one, for a value of the wrong type, or for a setting of
-            an earlier version (`GONE`) with another value than the one used now.
+            an earlier version (`GONE`) with another value than the one used now. A class may have such a setting again.
     """
     hints = typing.get_type_hints(type(default))
     names = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
-    gone = in_all_bases(type(default), "GONE")
+    gone = {key: now for key, now in in_all_bases(type(default), "GONE").items() if key not in names}
     changes = {}
     for key, value in values.items():
         if key in gone:

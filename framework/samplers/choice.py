@@ -24,7 +24,7 @@ from nerfloom.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
 from nerfloom.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
 
 NESTED_CELLS = 64
-"""Cells along each axis of each nested box."""
+"""Cells along each axis of each nested box, a multiple of 4; 128 in Instant-NGP."""
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
 PROPOSAL_SAMPLES, NERF_SAMPLES = (128, 64), 32

@@ -55,7 +55,6 @@ SMALLER: dict[str, Any] = {
     "log2_table_size": 12,
     "grid_resolution": 32,
     "hidden_width": 32,
-    "deformation_width": 32,
     "base_resolution": 16,
     "first_voxels": 32**3,
     "num_gaussians": 600,

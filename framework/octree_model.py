@@ -8,7 +8,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor, nn
 
-from nerfloom.base.config import AT_LEAST_0, Range, RayConfig
+from nerfloom.base.config import Range, RayConfig
 from nerfloom.base.optimised import Optimised
 from nerfloom.data.pixels.batch import PixelBatch
 from nerfloom.data.scene import Scene
@@ -43,13 +43,13 @@ class OctreeConfig(
 ):
     """Settings of learning an octree's leaves."""
 
-    RANGES: ClassVar[dict[str, Range]] = {"density_rate": AT_LEAST_0, "degree": (0, MAX_DEGREE)}
+    RANGES: ClassVar[dict[str, Range]] = {"degree": (0, MAX_DEGREE)}
     """Allowed ranges."""
-    density_rate: float = 5.0
-    """Learning rate of densities, relative to the rate of colours."""
     degree: int = 1
     """Degree of the harmonics of colours, 0 to 3."""
 
+    density_rate = 5.0
+    """Learning rate of densities, relative to the rate of colours."""
     images_per_batch = 2
     """Number of images with the rays of a step. Neighbouring rays meet leaves that are close together in memory, and a
     leaf of about a pixel is met by about one ray of a step, from whichever image."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from nerfloom import Decision, Field, LearnsMotion, Method, RayModel, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range
@@ -25,6 +25,8 @@ from nerfloom.samplers.motion import MotionConfig, slices_choice
 
 NUM_STEPS, HASH_NUM_STEPS = 192, 384
 """Steps along the diagonal of the box: with networks, and with a hash grid."""
+HASH_DEFORMATION = 64, 4, 4
+"""Size of the deformation network of a hash grid, as in `deformation_size`."""
 HASH_SAMPLES_PER_BATCH = 2**13
 """Samples per training step with an occupancy grid and a hash grid, which needs small networks only."""
 
@@ -52,39 +54,36 @@ class DNeRFConfig(
     RANGES: ClassVar[dict[str, Range]] = {
         "num_layers": (3, 64),
         "hidden_width": (2, 2**14),
-        "deformation_layers": (1, 64),
-        "deformation_width": (1, 2**14),
         "position_frequencies": (0, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
         "time_frequencies": (0, MAX_FREQUENCIES),
-        "deformation_frequencies": (0, MAX_FREQUENCIES),
         "ambient_dims": (0, 2**10),
         "grid_learning_rate": AT_LEAST_0,
         "max_resolution": (1, MAX_RESOLUTION),
         "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
     }
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {
+        "deformation_width": lambda config: deformation_size(config)[0],
+        "deformation_layers": lambda config: deformation_size(config)[1],
+        "deformation_frequencies": lambda config: deformation_size(config)[2],
+    }
+    """Settings of earlier versions."""
     variant: Literal["d-nerf", "t-nerf"] = "d-nerf"
     """d-nerf: a canonical field and a deformation network. t-nerf: one network of position and time."""
     canonical: Literal["network", "hash-grid"] = "network"
     """Canonical field of d-nerf: the paper's network, or a hash grid with small networks."""
     num_layers: int = 8
-    """Layers of the canonical network before its density output."""
+    """Layers of the canonical network before its density output, and hidden layers of the deformation network. A hash
+    grid has a smaller deformation network."""
     hidden_width: int = 256
-    """Features per layer of the canonical network."""
-    deformation_layers: Auto[int] = AUTO
-    """Hidden layers of the deformation network. auto: 8, or 4 with a hash grid."""
-    deformation_width: Auto[int] = AUTO
-    """Features per layer of the deformation network. auto: 256, or 64 with a hash grid."""
+    """Features per layer of the canonical network and of its deformation network."""
     position_frequencies: int = 10
-    """Number of frequencies in the encoding of positions."""
+    """Number of frequencies in the encoding of positions, of both networks."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions."""
     time_frequencies: Auto[int] = AUTO
     """Number of frequencies in the encoding of times. auto: 4, or 6 with a hash grid."""
-    deformation_frequencies: Auto[int] = AUTO
-    """Number of frequencies in the encoding of positions for the deformation network. auto: `position_frequencies`, or
-    4 with a hash grid."""
     ambient_dims: Auto[int] = AUTO
     """Further outputs of the deformation network, inputs of a hash grid's networks in addition to the displaced
     position. auto: 4 with a hash grid; otherwise none, as in the paper."""
@@ -103,6 +102,16 @@ class DNeRFConfig(
     Otherwise the first image is treated like the others."""
 
 
+def deformation_size(config: DNeRFConfig) -> tuple[int, int, int]:
+    """Return features per layer, hidden layers and frequencies of positions of the deformation network.
+
+    It is as large as the canonical network, as in the paper, or small if the canonical field is a hash grid.
+    """
+    if config.canonical == "hash-grid":
+        return HASH_DEFORMATION
+    return config.hidden_width, config.num_layers, config.position_frequencies
+
+
 class DNeRF(RayModel[DNeRFConfig], LearnsMotion, plain=True):
     """A model of a moving scene; for a scene without times it is the canonical field alone."""
 
@@ -119,9 +128,6 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
     config, made = fill(
         config,
         chosen,
-        Choice("deformation_layers", 4 if grid else 8, network),
-        Choice("deformation_width", 64 if grid else 256, network),
-        Choice("deformation_frequencies", 4 if grid else config.position_frequencies, network),
         Choice("time_frequencies", 6 if grid else 4, network),
         Choice("ambient_dims", 4 if grid else 0, network),
     )
@@ -144,7 +150,7 @@ def decide(config: DNeRFConfig, scene: Scene) -> tuple[DNeRFConfig, list[Decisio
         config, more = decide_samples(config, samples)
         made += more
     if not scene.moving:
-        learnt = ("deformation", "time", "ambient")
+        learnt = ("time", "ambient")
         made = [decision for decision in made if not decision.option.startswith(learnt)]
         made.append(Decision("deformation", "left out", "the images have no times"))
     return config, made
@@ -174,9 +180,7 @@ def make_field(config: DNeRFConfig, scene: Scene) -> Field:
         return canonical
     deformed = DeformedField(
         canonical,
-        config.deformation_width,
-        config.deformation_layers,
-        config.deformation_frequencies,
+        *deformation_size(config),
         config.time_frequencies,
         contracted,
         config.from_first_image,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from torch import Tensor
 
@@ -75,29 +75,33 @@ class MipNeRF360Config(
     RANGES: ClassVar[dict[str, Range]] = {
         "num_layers": (3, 64),
         "hidden_width": (2, 2**14),
-        "proposal_layers": (1, 64),
-        "proposal_width": (2, 2**14),
         "position_frequencies": (1, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
         "distortion_loss_mult": AT_LEAST_0,
     }
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {
+        "proposal_width": lambda config: proposal_size(config)[0],
+        "proposal_layers": lambda config: proposal_size(config)[1],
+    }
+    """Settings of earlier versions."""
     encoding: Auto[Literal["integrated", "hash-grid"]] = AUTO
     """integrated: the paper's networks. hash-grid: hash grids with small networks. auto: hash-grid on a CPU."""
     distortion_loss_mult: Auto[float] = AUTO
     """Weight of the distortion loss. auto: 0.01 in unbounded scenes, otherwise 0."""
     num_layers: int = 8
-    """Layers of the network before its density output (integrated)."""
+    """Layers of the network before its density output. The proposal network has half of them (integrated)."""
     hidden_width: int = 1_024
-    """Features per layer of the network (integrated)."""
-    proposal_layers: int = 4
-    """Hidden layers of the proposal network (integrated)."""
-    proposal_width: int = 256
-    """Features per layer of the proposal network (integrated)."""
+    """Features per layer of the network. The proposal network has a quarter of them (integrated)."""
     position_frequencies: int = 12
     """Number of frequencies in the integrated encoding of positions (integrated)."""
     direction_frequencies: int = 4
     """Number of frequencies in the encoding of directions (integrated)."""
+
+
+def proposal_size(config: MipNeRF360Config) -> tuple[int, int]:
+    """Return features per layer and hidden layers of the proposal network: 256 and 4 in the paper."""
+    return max(config.hidden_width // 4, 1), config.num_layers // 2
 
 
 class SmoothColorError(ColorError):
@@ -161,7 +165,7 @@ def make_field(config: MipNeRF360Config, scene: Scene) -> Field:
 def make_proposals(config: MipNeRF360Config, scene: Scene) -> Sequence[Field]:
     """Return the density fields of the proposals: one network for all levels, or a hash grid for each."""
     if config.encoding == "integrated":
-        network = IntegratedDensity(_encoding(config, scene), config.proposal_width, config.proposal_layers)
+        network = IntegratedDensity(_encoding(config, scene), *proposal_size(config))
         network.optimised = Optimised(
             "proposals", config.learning_rate, (config.adam_beta1, config.adam_beta2), config.adam_eps
         )

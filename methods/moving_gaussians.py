@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -26,6 +26,8 @@ from nerfloom.splats.table import Column
 
 DURATIONS: Range = (1e-4, 1e3)
 """Allowed range of a duration, in the time from 0 to 1. Above about 10 nothing fades."""
+MOMENT_RATE, DURATION_RATE = 1.6e-4, 5e-3
+"""Learning rates of moments, in the time from 0 to 1, and of the logarithms of durations, before --rate-factor."""
 MAX_LOGIT = 30.0
 """Maximum logit before fading. Its opacity is within 1e-13 of 1, and its exponential is finite in float32."""
 
@@ -36,18 +38,14 @@ class MovingGaussiansConfig(GaussianSplattingConfig, noise=0.0, opacity_penalty=
 
     RANGES: ClassVar[dict[str, Range]] = {
         "velocity_rate": AT_LEAST_0,
-        "moment_rate": AT_LEAST_0,
-        "duration_rate": AT_LEAST_0,
         "start_duration": DURATIONS,
         "min_duration": DURATIONS,
     }
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {"moment_rate": MOMENT_RATE, "duration_rate": DURATION_RATE}
+    """Settings of earlier versions."""
     velocity_rate: float = 1.6e-3
     """Learning rate of velocities, in sizes of the scene for the time from 0 to 1, before --rate-factor."""
-    moment_rate: float = 1.6e-4
-    """Learning rate of moments, in the time from 0 to 1, before --rate-factor."""
-    duration_rate: float = 5e-3
-    """Learning rate of the logarithms of durations, before --rate-factor."""
     start_duration: float = 0.1
     """Duration of Gaussians at the start: the standard deviation of their visibility, in the time from 0 to 1."""
     min_duration: Auto[float] = AUTO
@@ -79,7 +77,7 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
         if not self.scene.moving:
             return usual
         velocity, moment, duration = (
-            config.rate_factor * rate for rate in (config.velocity_rate, config.moment_rate, config.duration_rate)
+            config.rate_factor * rate for rate in (config.velocity_rate, MOMENT_RATE, DURATION_RATE)
         )
         return {
             **usual,

@@ -6,7 +6,7 @@ Chen et al., "TensoRF: Tensorial Radiance Fields", ECCV 2022.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -37,6 +37,8 @@ VERTICES_PER_PIXEL = 2
 MIN_SAMPLES, MAX_SAMPLES, MIN_SAMPLES_SECONDS = 2**13, 2**15, 150.0
 """Samples per training step for short and long times, and the seconds before they grow. On Lego 2^13 and 2^14
 samples gave 32.18 and 31.91 dB after 150 s."""
+NETWORK_RATE = 1e-3
+"""Initial learning rate of the basis and the colour network, the authors'."""
 MARGIN = 1
 """Cells of the occupancy grid kept around the occupied ones when the box shrinks."""
 
@@ -55,7 +57,6 @@ class TensoRFConfig(
     """Settings of tensorf."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "network_learning_rate": AT_LEAST_0,
         "density_components": (1, 2**14),
         "appearance_components": (1, 2**14),
         "first_voxels": (8, 2**30),
@@ -66,8 +67,8 @@ class TensoRFConfig(
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
-    network_learning_rate: float = 1e-3
-    """Initial learning rate of the basis and the colour network."""
+    GONE: ClassVar[dict[str, Any]] = {"network_learning_rate": NETWORK_RATE}
+    """Settings of earlier versions."""
     decomposition: Literal["vm", "cp"] = "vm"
     """vm: planes and lines. cp: lines only, which take less than 4 MB and learn more slowly."""
     density_components: Auto[int] = AUTO
@@ -226,7 +227,7 @@ def make_field(config: TensoRFConfig, scene: Scene) -> TensorField:
     )
     unbounded = contracted_box(config, scene) is not None
     field = TensorField(scene.box, density, appearance, config.hidden_width, unbounded=unbounded)
-    field.optimised = Optimised("networks", learning_rate=config.network_learning_rate)
+    field.optimised = Optimised("networks", learning_rate=NETWORK_RATE)
     for factors in (density, appearance):
         factors.optimised = Optimised("tables", config.learning_rate, sparse=config.sparse_updates)
         with torch.no_grad():  # CP multiplies three factors, so they start larger, as in the authors' code

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -48,6 +48,8 @@ VARIED_BRICKS, STEPS_PER_VARIATION = 32, 4
 """Number of bricks with total variation in the loss, and number of steps from one such step to the next."""
 COLOR_VARIATION = 0.1
 """Weight of the total variation of colours, relative to that of opacities."""
+DENSITY_RATE = 16.0
+"""Learning rate of densities, relative to the rate of colours."""
 RAYS_PER_LOOK = 8
 """One training ray out of this number is followed to its end. It also meets leaves behind others, which are then known
 to be hidden."""
@@ -62,7 +64,6 @@ class VoxelsConfig(
     learning_rate=0.025,
     lr_schedule="hold-exponential",
     lr_final=0.05,
-    density_rate=16.0,
     samples_per_batch=2**17,
 ):
     """Settings of voxels."""
@@ -75,6 +76,8 @@ class VoxelsConfig(
         "total_variation": AT_LEAST_0,
     }
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {"silhouette_pixels": True, "density_rate": DENSITY_RATE}
+    """Settings of earlier versions."""
     resolution: Auto[int] = AUTO
     """Cells along the longest edge of the box that silhouettes leave, at the end of training. auto: chosen from the
     images and the training time."""
@@ -88,10 +91,10 @@ class VoxelsConfig(
     total_variation: float = 0.01
     """Weight of the total variation of opacities between neighbouring leaves; colours have a tenth."""
     silhouette_cells: bool = True
-    """Place no leaf where an image's alpha channel shows empty space."""
-    silhouette_pixels: bool = True
-    """Never draw pixels if their ray passes only through such empty space."""
+    """Place no leaf where an image's alpha channel shows empty space, and never draw pixels if their ray passes only
+    through such space."""
 
+    density_rate = DENSITY_RATE
     images_per_batch = 0  # large leaves are met by many rays of a step, which should be from many directions
 
 

@@ -15,7 +15,7 @@ Further differences from the paper:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from nerfloom import ConfigError, Decision, Method, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, Range
@@ -25,13 +25,17 @@ from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import DensityField
 from nerfloom.fields.multisampled import MultisampledDensity, MultisampledField
-from nerfloom.kernels.grids.hash_grid_layout import MAX_LEVELS, MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
+from nerfloom.kernels.grids.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.samplers.choice import decide_samples, make_sampler
 from nerfloom.samplers.proposal import ProposalSampler
 
+POWER_LADDER = -1.5
+"""Exponent of the power ladder that spaces distances if space is contracted, the paper's for all scenes."""
+PROPOSAL_LEVELS = 5
+"""Number of levels of each proposal's hash grid."""
 SAMPLES_PER_BATCH = 2**14
 """Samples per training step with an occupancy grid over a box."""
 
@@ -57,18 +61,16 @@ class ZipNeRFConfig(
     """Settings of zip-nerf; open ones depend on the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "power_ladder": (-1e3, 1),
         "interlevel_blurs": (1e-6, 1),
         "hash_decay_mult": AT_LEAST_0,
-        "num_proposal_levels": (1, MAX_LEVELS),
         "proposal_resolutions": (1, MAX_RESOLUTION),
         "proposal_log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
         "hidden_width": (1, 2**14),
     }
     """Allowed range of each numeric setting."""
+    GONE: ClassVar[dict[str, Any]] = {"power_ladder": POWER_LADDER, "num_proposal_levels": PROPOSAL_LEVELS}
+    """Settings of earlier versions."""
     changing_light = "affine"
-    power_ladder: float = -1.5
-    """Exponent of the power ladder that spaces distances if space is contracted."""
     interlevel_blurs: tuple[float, ...] = (0.03, 0.003)
     """Radius of the box filter on the samples' histogram in each proposal's loss, in normalised distance."""
     hash_decay_mult: float = 0.0
@@ -77,8 +79,6 @@ class ZipNeRFConfig(
     multisampled_proposals: bool = False
     """Whether proposals are also looked up at several points per interval, in grids of one feature per vertex, as in
     the paper; otherwise at one point, with two features. The paper's grids have up to 512 and 2048 cells per axis."""
-    num_proposal_levels: int = 5
-    """Number of levels of each proposal's hash grid."""
     proposal_resolutions: tuple[int, ...] = (128, 256)
     """Cells per axis at the finest level of each proposal's hash grid."""
     proposal_log2_table_size: int = 16
@@ -124,7 +124,7 @@ def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
 
     def proposal(finest: int) -> DensityField:
         features = 1 if config.multisampled_proposals else 2
-        sizes = config.num_proposal_levels, features, config.base_resolution, finest, config.proposal_log2_table_size
+        sizes = PROPOSAL_LEVELS, features, config.base_resolution, finest, config.proposal_log2_table_size
         if not config.multisampled_proposals:
             return DensityField(scene.box, HashGrid(*sizes), unbounded=scene.unbounded)
         grid = MultisampledHashGrid(*sizes, config.sparse_updates, config.hash_decay_mult)
@@ -136,7 +136,7 @@ def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
         unbounded=scene.unbounded,
         endless=scene.unbounded and not scene.has_alpha,
         fields=[proposal(finest) for finest in config.proposal_resolutions],
-        ladder=config.power_ladder,
+        ladder=POWER_LADDER,
         blurs=config.interlevel_blurs,
     )
     made.samples_per_step = config.samples_per_batch

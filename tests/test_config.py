@@ -32,14 +32,24 @@ class Younger(RayConfig):
 
 @dataclass(frozen=True)
 class Youngest(Younger):
-    GONE: typing.ClassVar[dict[str, object]] = {"blocks": 3}
+    GONE: typing.ClassVar[dict[str, object]] = {"blocks": 3, "half_rays": lambda config: config.num_rays_per_batch // 2}
+
+
+@dataclass(frozen=True)
+class WithBlocks(Youngest):
+    blocks: int = 5
 
 
 def test_files_with_settings_that_are_gone_are_read_if_nothing_changes() -> None:
     text = yaml.safe_dump({"learning_rate": 0.5, "blur_widths": [1, 2.5], "blocks": 3})
     assert from_plain(Youngest(), yaml.safe_load(text), "text") == Youngest(learning_rate=0.5)
-    with pytest.raises(ConfigError, match="text: 'blocks' is 4, but now it is always 3; leave it out"):
+    with pytest.raises(ConfigError, match="text: 'blocks' is 4, but now it is 3; leave it out"):
         from_plain(Youngest(), {"blocks": 4}, "text")
+    fewer = {"half_rays": 8, "num_rays_per_batch": 16}  # compared with the settings of the file, not with the defaults
+    assert from_plain(Youngest(), fewer, "text") == Youngest(num_rays_per_batch=16)
+    with pytest.raises(ConfigError, match="text: 'half_rays' is 8, but now it is 16; leave it out"):
+        from_plain(Youngest(), {**fewer, "num_rays_per_batch": 32}, "text")
+    assert from_plain(WithBlocks(), {"blocks": 4}, "text") == WithBlocks(blocks=4)
     with pytest.raises(ConfigError, match="unknown key 'blocks'"):
         from_plain(Younger(), {"blocks": 3}, "text")
 

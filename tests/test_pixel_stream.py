@@ -110,7 +110,7 @@ def test_what_a_step_draws_first_does_not_depend_on_how_many_it_draws(both: tupl
 
 
 @pytest.mark.medium
-@pytest.mark.parametrize("changes", [{}, {"robust": "errors"}, {"silhouette_pixels": False}])
+@pytest.mark.parametrize("changes", [{}, {"robust": "errors"}, {"silhouette_cells": False}])
 def test_a_run_from_a_file_is_the_run_from_memory(shared_tiny: Path, tmp_path: Path, changes: dict) -> None:
     settings = {"max_num_iterations": STEPS, "cache_dir": tmp_path / "cache", **changes}
     here = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "here", **settings)

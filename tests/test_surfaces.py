@@ -355,8 +355,8 @@ def test_a_hole_is_learnt(name: str, shape: Callable[[Tensor], Tensor]) -> None:
     colors = torch.cat([0.5 + 0.4 * torch.nn.functional.normalize(normals, dim=-1), met], dim=-1)
     shown = dataclasses.replace(data, pixels=(255 * colors.detach()).round().to(torch.uint8))
     finer = {"num_levels": 8, "max_resolution": 128, "log2_table_size": 14, "grid_resolution": 32, "num_steps": 128}
-    by_pixels = {"silhouette_cells": False, "silhouette_pixels": False}
-    trainer = trainer_on(shown, name, max_num_iterations=400, samples_per_batch=8192, **finer, **by_pixels)
+    settings = {"max_num_iterations": 400, "samples_per_batch": 8192, "silhouette_cells": False, **finer}
+    trainer = trainer_on(shown, name, **settings)
     for _ in trainer.steps():
         pass
     model = trainer.model.eval()

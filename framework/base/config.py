@@ -64,8 +64,9 @@ class TrainConfig:
     """Allowed ranges; a method's config adds or overrides some. Every range allows None; each number of a tuple is
     checked."""
     GONE: ClassVar[dict[str, Any]] = {}
-    """Settings of earlier versions, each with the value that is used now. A method's config adds some. Files with
-    this value are read, so that old runs open; files with another are refused."""
+    """Settings of earlier versions, each with the value that is used now, or with a function of the settings that
+    returns this value. A method's config adds some. Files with this value are read, so that old runs open; files with
+    another are refused."""
     data: Path | None = None
     """Folder of the data set. Default: the embedded scene."""
     max_train_images: int | None = None
@@ -153,7 +154,7 @@ class TrainConfig:
     sampler, bounded_sampler, time_slices, robust = "", "occupancy", 1, "off"
     appearance = changing_light = "none"
     background_model, directional = "contraction", "view"
-    learns_motion = smallest_box = silhouette_cells = silhouette_pixels = seen_cells = False
+    learns_motion = smallest_box = silhouette_cells = seen_cells = False
     rays_shared_by = images_per_batch = num_coarse_samples = num_fine_samples = appearance_embedding_dim = 0
     depth_loss_mult = free_space_loss_mult = 0.0
 

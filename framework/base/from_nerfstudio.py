@@ -40,6 +40,7 @@ SETTINGS = {
     "sh-degree": "--degree",
     "max-gs-num": "--num-gaussians",
     "ssim-lambda": "--ssim-weight",
+    "stop-split-at": "--growth-end",
 }
 """Last part of a nerfstudio flag -> the equivalent flag here. Flags of the same name need no entry."""
 TAKEN = (

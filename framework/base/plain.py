@@ -38,16 +38,14 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
 
     Raises:
         ConfigError: for an unknown key, with the nearest valid one, for a value of the wrong type, or for a setting of
-            an earlier version (`GONE`) with another value than the one used now.
+            an earlier version (`GONE`) with another value than the one used now. A class may have such a setting again.
     """
     hints = typing.get_type_hints(type(default))
     names = {f.name for f in dataclasses.fields(default)}  # type: ignore[arg-type]
-    gone = in_all_bases(type(default), "GONE")
+    gone = {key: now for key, now in in_all_bases(type(default), "GONE").items() if key not in names}
     changes = {}
     for key, value in values.items():
         if key in gone:
-            if value != to_plain(gone[key]):
-                raise ConfigError(f"{where}: '{key}' is {shown(value)}, but now it is always {gone[key]}; leave it out")
             continue
         if key not in names:
             name = key if isinstance(key, str) else shown(key)
@@ -57,7 +55,12 @@ def from_plain(default: T, values: dict[str, Any], where: str) -> T:
             changes[key] = from_plain(current, value, f"{where}: {key}")
         else:
             changes[key] = converted(value, hints[key], f"{where}: '{key}'")
-    return dataclasses.replace(default, **changes)  # type: ignore[type-var]
+    config = dataclasses.replace(default, **changes)  # type: ignore[type-var]
+    for key in (key for key in values if key in gone):
+        now = gone[key](config) if callable(gone[key]) else gone[key]
+        if values[key] != to_plain(now):
+            raise ConfigError(f"{where}: '{key}' is {shown(values[key])}, but now it is {now}; leave it out")
+    return config
 
 
 def converted(value: Any, hint: Any, where: str) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 from torch import Tensor
 
@@ -23,6 +23,8 @@ from nerfloom.samplers.motion import vertices_in_time
 from nerfloom.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
 from nerfloom.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
 
+NESTED_CELLS = 64
+"""Cells along each axis of each nested box, a multiple of 4; 128 in Instant-NGP."""
 COARSEST_PROPOSAL = 128
 """Cells along an axis at the finest level of the first proposal; each further proposal has twice as many."""
 PROPOSAL_SAMPLES, NERF_SAMPLES = (128, 64), 32
@@ -42,7 +44,6 @@ class SamplingConfig(RayConfig):
 
     RANGES: ClassVar[dict[str, Range]] = {
         "grid_resolution": (1, MAX_CELLS),
-        "nested_resolution": (4, MAX_CELLS),
         "grid_levels": (1, MAX_LEVELS),
         "cone_angle": (0, 1),
         "num_steps": (1, 2**20),
@@ -53,18 +54,17 @@ class SamplingConfig(RayConfig):
         "num_nerf_samples": (1, 2**14),
     }
     """Minimum and maximum of these settings."""
+    GONE: ClassVar[dict[str, Any]] = {"silhouette_pixels": True, "nested_resolution": NESTED_CELLS}
+    """Settings of earlier versions."""
     sampler: Auto[Literal["occupancy", "proposal"]] = AUTO
     """occupancy: march through the occupied cells of the box, or of nested boxes if the scene may extend beyond the
     box. proposal: small density fields choose the samples. auto: proposal if the scene may extend beyond the box,
     otherwise occupancy. For scenes that may extend beyond the box, both sample all of space, contracted."""
     silhouette_cells: bool = True
-    """Never sample cells of the occupancy grid that an image's alpha channel shows to be empty (occupancy)."""
-    silhouette_pixels: bool = True
-    """Never draw pixels if their ray passes only through such empty cells (occupancy)."""
+    """Never sample cells of the occupancy grid that an image's alpha channel shows to be empty, and never draw pixels
+    if their ray passes only through such cells (occupancy)."""
     grid_resolution: int = 128
     """Cells along each axis of the occupancy grid (occupancy, in a box)."""
-    nested_resolution: int = 64
-    """Cells along each axis of each nested box, a multiple of 4 (occupancy, beyond the box)."""
     grid_levels: int = 8
     """Maximum number of nested boxes, each twice as large as the one before; fewer if these reach the far end of the
     scene (occupancy, beyond the box)."""
@@ -239,7 +239,7 @@ def make_sampler(
         levels = _levels(config, scene) if scene.unbounded else 1
         sampler = OccupancySampler(
             scene.box,
-            config.nested_resolution if scene.unbounded else config.grid_resolution,
+            NESTED_CELLS if scene.unbounded else config.grid_resolution,
             config.num_steps,
             config.early_stop,
             config.train_early_stop,

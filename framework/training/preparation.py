@@ -225,7 +225,7 @@ def skip_by_silhouettes(config: TrainConfig, model: Model[Any], dataset: Dataset
         for grid, hull in zip(grids, hulls, strict=True):
             grid.carve(hull)
     # In a moving scene, a pixel that is empty at its time supervises cells that are occupied at other times.
-    if not config.silhouette_pixels or moving or not all(bool(grid.carved.any()) for grid in grids):
+    if moving or not all(bool(grid.carved.any()) for grid in grids):
         return dataset
     near = [
         pixels_near(silhouettes, kept, box, grid.resolution)

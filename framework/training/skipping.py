@@ -132,7 +132,7 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
         says = f"pixels that show only background: {share:.0%} of all are never drawn"
         if share < 1:
             says += f", and the others {1 / (1 - share):.1f} x as often"
-        rungs.append(Rung("pixels, which see background alone", share, None, "--silhouette-pixels False", says))
+        rungs.append(Rung("pixels, which see background alone", share, None, "--silhouette-cells False", says))
     return rungs
 
 

@@ -122,7 +122,7 @@ def test_flags_stand_with_what_they_belong_to() -> None:
     found, plain = help_of("nerfacto"), help_of("vanilla-nerf")
     belongs = {
         "nerfacto": ["--num-levels", "--camera-learning-rate"],
-        "sampler": ["--sampler", "--early-stop", "--num-proposal-samples", "--silhouette-pixels"],
+        "sampler": ["--sampler", "--early-stop", "--num-proposal-samples", "--silhouette-cells"],
         "ray": ["--num-rays-per-batch", "--train-rays-per-pixel-from"],
         "robust": ["--robust"],
         "teacher": ["--teacher", "--teacher-share", "--teacher-until"],

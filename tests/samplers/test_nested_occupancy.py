@@ -197,10 +197,10 @@ def test_what_cannot_be_nested_is_refused(levels: int, resolution: int) -> None:
 
 
 def test_the_choice_for_a_capture() -> None:
-    config = SamplingConfig(sampler="occupancy", nested_resolution=16, grid_levels=12, num_steps=100)
+    config = SamplingConfig(sampler="occupancy", grid_levels=12, num_steps=100)
     made = make_sampler(config, CAPTURE)
     assert isinstance(made, OccupancySampler)
-    assert (made.levels, made.resolution, made.endless, made.cone) == (11, 16, True, 1 / 64)  # 2^10 > 1000
+    assert (made.levels, made.resolution, made.endless, made.cone) == (11, 64, True, 1 / 64)  # 2^10 > 1000
     assert torch.equal(contracted_box(config, CAPTURE), BOX)
     boxed = dataclasses.replace(CAPTURE, unbounded=False)
     made = make_sampler(config, boxed)
@@ -213,7 +213,7 @@ def test_the_choice_for_a_capture() -> None:
 
 @pytest.mark.parametrize(("far", "levels"), [(0.5, 1), (1.0, 1), (2.0, 2), (1000.0, 11), (1e30, 12), (math.inf, 12)])
 def test_boxes_reach_the_far_end_as_far_as_there_may_be_boxes(far: float, levels: int) -> None:
-    config = SamplingConfig(sampler="occupancy", nested_resolution=4, grid_levels=12)
+    config = SamplingConfig(sampler="occupancy", grid_levels=12)
     made = make_sampler(config, dataclasses.replace(CAPTURE, far=far))
     assert isinstance(made, OccupancySampler)
     assert made.levels == levels
@@ -246,7 +246,7 @@ def test_a_wide_lens_shows_more_beside_its_middle() -> None:
 
 def captured(method: str, data: Path, folder: Path, **facts: object) -> Trainer:
     """A trainer on the tiny data set as if its scene had no bounds."""
-    settings = {"sampler": "occupancy", "nested_resolution": 16, "grid_levels": 4, "num_steps": 400}
+    settings = {"sampler": "occupancy", "grid_levels": 4, "num_steps": 400}
     still = tiny_trainer("instant-ngp", data, folder / "still").train_set
     (folder / "run").mkdir()
     scene = dataclasses.replace(still.scene, unbounded=True, far=100.0, **facts)
@@ -263,8 +263,8 @@ def test_a_capture_is_learnt_and_its_grid_kept(method: str, shared_tiny: Path, t
         report = trainer.train_step()
     assert report.losses["rgb"] < 0.7 * first
     grid = trainer.model.sampler
-    assert (grid.levels, grid.resolution, trainer.model.field.unbounded) == (4, 16, True)
-    own = own_cells(4, 16)
+    assert (grid.levels, grid.resolution, trainer.model.field.unbounded) == (4, 64, True)
+    own = own_cells(4, 64)
     assert 0 < int(grid.occupied.sum()) < 0.9 * int(own.sum())  # silhouettes alone show a part to be empty
     trainer.save()
     again = captured(method, shared_tiny, tmp_path / "again")

@@ -35,8 +35,8 @@ TINY: dict[str, dict[str, Any]] = {
     "nerf-w+frequency": {**MARCHED, "encoding": "frequency", "sampler": "occupancy", "samples_per_batch": 2048},
     "mip-nerf-360": {**GRID, **PROPOSED, "encoding": "hash-grid", "lr_warmup_steps": 0},
     "mip-nerf-360+integrated": {
-        **NETWORK, "encoding": "integrated", "proposal_layers": 2, "proposal_width": 16, "position_frequencies": 6,
-        "num_proposal_samples": (16, 16), "num_nerf_samples": 8, "num_rays_per_batch": 128, "lr_warmup_steps": 0,
+        **NETWORK, "encoding": "integrated", "position_frequencies": 6, "num_proposal_samples": (16, 16),
+        "num_nerf_samples": 8, "num_rays_per_batch": 128, "lr_warmup_steps": 0,
     },
     "kilo-nerf": {
         **MARCHED, "network_resolution": 3, "hidden_width": 16, "position_frequencies": 4, "learning_rate": 1e-2,
@@ -51,9 +51,7 @@ TINY: dict[str, dict[str, Any]] = {
         "hidden_width": 32,
     },
     "nerfacto": {**GRID, **PROPOSED, "sampler": "proposal"},
-    "zip-nerf": {
-        **GRID, **PROPOSED, "sampler": "proposal", "num_proposal_levels": 3, "proposal_resolutions": (32, 64),
-    },
+    "zip-nerf": {**GRID, **PROPOSED, "sampler": "proposal", "proposal_resolutions": (32, 64)},
     "neus": {**GRID, **MARCHED, "hidden_width": 32},
     "neus+frequency": DISTANCE,
     "ref-nerf": {**GRID, **MARCHED, "hidden_width": 32},
@@ -68,7 +66,7 @@ TINY: dict[str, dict[str, Any]] = {
         "num_source_views": 3, "images_per_batch": 4, "num_coarse_samples": 12, "num_fine_samples": 12,
         "hidden_width": 32, "encoder_widths": (8, 8), "num_rays_per_batch": 128, "learning_rate": 3e-3,
     },
-    "dnerf": {**NETWORK, **TWO_PASSES, "deformation_layers": 2, "deformation_width": 32},
+    "dnerf": {**NETWORK, **TWO_PASSES},
 }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import ConfigError
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.dataset import Dataset
@@ -131,9 +132,7 @@ def fused_mesh(
     Raises:
         ConfigError: if no view sees a surface in the box.
     """
-    views = min(settings.max_num_views, len(dataset))
-    chosen = torch.linspace(0, len(dataset) - 1, views, dtype=torch.float64).round().long()
-    chosen = chosen.to(dataset.device)
+    chosen = torch.tensor(evenly_spread(len(dataset), settings.max_num_views), device=dataset.device)
     cameras, times = dataset.cameras[chosen], None if dataset.times is None else dataset.times[chosen]
     stride = tsdf.stride_for(cameras, lattice)
     rendered = tsdf.rendered_views(model, cameras, times, model.background, stride)

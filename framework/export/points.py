@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import track
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_pixels
 from nerfloom.renderable import Renderable, RendersRays
@@ -108,7 +109,7 @@ def picture_points(model: Renderable, dataset: Dataset, count: int, reach: float
         reach: as in `surface_points`.
     """
     background, far = model.background, model.scene.far
-    views = torch.linspace(0, len(dataset) - 1, num_views(dataset), dtype=torch.float64).round().long().tolist()
+    views = evenly_spread(len(dataset), MAX_VIEWS)
     for number, index in enumerate(views):
         view = replace(dataset.view(index), image=None)
         picture = model.render_view(view, background)

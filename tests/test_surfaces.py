@@ -15,7 +15,8 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import PixelBatch, draw_batch
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.export.lattice import lattice_of
-from nerfloom.export.meshing import Cleaning, distance_mesh
+from nerfloom.export.meshing import level_set_mesh
+from nerfloom.export.settings import MarchingCubesSettings
 from nerfloom.fields.distance import GridDistance, Shape
 from nerfloom.fields.surface import NeuSField, SurfaceField
 from nerfloom.geometry.points import Points
@@ -314,7 +315,8 @@ def test_a_ball_is_learnt_and_meshed(name: str) -> None:
     for _ in trainer.steps():
         pass
     model = trainer.model.eval()
-    mesh = distance_mesh(model, lattice_of(model.scene.box, 48), trainer.train_set.cameras, Cleaning(num_components=1))
+    settings = MarchingCubesSettings(num_components=1)
+    mesh = level_set_mesh(model, lattice_of(model.scene.box, 48), trainer.train_set.cameras, settings)
     assert mesh.normals is not None
     radii = mesh.vertices.norm(dim=-1)
     print(name, radii.mean(), radii.std(), len(mesh.faces))
@@ -360,7 +362,8 @@ def test_a_hole_is_learnt(name: str, shape: Callable[[Tensor], Tensor]) -> None:
     for _ in trainer.steps():
         pass
     model = trainer.model.eval()
-    mesh = distance_mesh(model, lattice_of(model.scene.box, 64), data.cameras, Cleaning(num_components=1))
+    settings = MarchingCubesSettings(num_components=1)
+    mesh = level_set_mesh(model, lattice_of(model.scene.box, 64), data.cameras, settings)
     errors = shape(mesh.vertices.float()).abs()
     angle = torch.arange(64) * (2 * math.pi / 64)
     circle = torch.stack([0 * angle, angle.cos(), angle.sin()], dim=-1)

@@ -7,7 +7,7 @@ and its centre lies at (0.5, 0.5); `camera_to_worlds` maps camera to scene coord
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -19,6 +19,7 @@ from nerfloom.base.device import runs_ahead
 from nerfloom.base.errors import DataError
 from nerfloom.geometry.lenses import DISTORTED, LENSES, Distortion, LensRays, iterations_needed, project, unproject
 from nerfloom.geometry.rays import Rays
+from nerfloom.geometry.records import TensorRows
 from nerfloom.kernels import native
 from nerfloom.kernels.argument_checks import check_indices, is_followed
 from nerfloom.kernels.dispatch import CPP, Operation
@@ -36,7 +37,7 @@ COMPILED = ("pinhole", *DISTORTED)
 
 
 @dataclass(frozen=True)
-class Cameras:
+class Cameras(TensorRows):
     """M cameras of one model. Intrinsics are in pixels of the corresponding images.
 
     The unit of a focal length depends on the model: pixels per tangent (pinhole, opencv), per radian (fisheye, and
@@ -72,23 +73,9 @@ class Cameras:
     def __len__(self) -> int:
         return self.camera_to_worlds.shape[0]
 
-    def __getitem__(self, index: Tensor | slice) -> Cameras:
-        """Return the cameras selected by a slice, a mask or an index tensor."""
-        return self._map(lambda values: values[index])
-
-    def to(self, device: torch.device | str) -> Cameras:
-        """Return the cameras on `device`."""
-        return self._map(lambda values: values.to(device))
-
     def in_float64(self) -> Cameras:
         """Return the cameras with all floating-point numbers in float64."""
-        return self._map(lambda values: values.double() if values.is_floating_point() else values)
-
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Cameras:
-        """Apply a function to every tensor."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {name: change(value) for name, value in values.items() if isinstance(value, Tensor)}
-        return replace(self, **changed)
+        return self.map(lambda values: values.double() if values.is_floating_point() else values)
 
     def scaled(self, factor: float | Tensor) -> Cameras:
         """Return the cameras of resized images.

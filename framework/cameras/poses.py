@@ -24,6 +24,8 @@ SMALL_VIEW = 0.5
 """Minimum width of the view where cameras look, scene units; a smaller scene is enlarged (`enlargement`)."""
 MIN_SHARE_LOOKING = 0.9
 """Fraction of the cameras that must see the common point they look at, for a scene to be enlarged."""
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+"""The up direction of scenes."""
 Y_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 """Quarter turn about x, which turns +z to +y."""
 LOOKING = 0.5
@@ -74,6 +76,11 @@ class Placement:
     def original_directions(self, directions: Tensor) -> Tensor:
         """Rotate unit `directions` (K, 3) from the scene's frame to the input's, float64."""
         return directions.double() @ self.transform[:, :3]
+
+    @property
+    def up(self) -> Tensor:
+        """(3,) float64 up direction of the scene, in the input's frame."""
+        return self.original_directions(UP[None])[0]
 
     def similarity(self) -> tuple[Tensor, float, Tensor]:
         """Return rotation (3, 3), scale and shift (3,) of `points`: x -> scale * rotation @ x + shift."""
@@ -137,8 +144,7 @@ class Placement:
         It is the smallest rotation that turns the up direction to z, followed by a quarter turn about x. So it is
         (x, y, z) -> (x, z, -y) where z is up in the input.
         """
-        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        return Y_UP @ rotation_between(self.original_directions(up[None])[0], up)
+        return Y_UP @ rotation_between(self.up, UP)
 
     def original_poses(self, poses: Tensor) -> Tensor:
         """Transform `poses` (M, 3, 4) from the scene's frame to the input's, float64: the inverse of `poses`."""
@@ -173,7 +179,7 @@ def place(
     if orientation in ("auto", "up"):
         turned = sideways_up(precise) if orientation == "auto" else None
         up = precise[:, :, 1].mean(0) if turned is None else turned
-        rotation = rotation_between(up, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        rotation = rotation_between(up, UP)
     elif orientation == "pca":
         rotation = _principal_axes(origins, precise[:, :, 1].mean(0))
     transform = torch.cat([rotation, -(rotation @ middle)[:, None]], dim=-1)

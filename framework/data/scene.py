@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nerfloom.base.checked import checked
 from nerfloom.base.errors import shown
+from nerfloom.geometry.records import TensorRecord
 
 PoseSource = Literal["exact", "photographs", "device"]
 """Source of the cameras' poses: known exactly, estimated from the images, or tracked by the device that took them."""
@@ -25,7 +26,7 @@ MAX_COORDINATE = 1e9
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(TensorRecord):
     """Properties of the data, read before training."""
 
     box: Tensor
@@ -112,10 +113,3 @@ class Scene:
             return False
         centres = self.camera_to_worlds[..., 3]
         return bool(((centres > self.box[0]) & (centres < self.box[1])).all(-1).any())
-
-    def to(self, device: torch.device | str) -> Scene:
-        """Return the scene on `device`."""
-        tensors: dict[str, Any] = {
-            name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
-        }
-        return replace(self, **tensors)

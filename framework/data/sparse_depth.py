@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.data.tracks import Sightings
+from nerfloom.geometry.records import TensorRows
 
 
 @dataclass(frozen=True)
-class SparseDepth:
+class SparseDepth(TensorRows):
     """K pixels in ascending order, each with a distance."""
 
     pixels: Tensor
@@ -24,14 +25,6 @@ class SparseDepth:
 
     def __len__(self) -> int:
         return len(self.pixels)
-
-    def __getitem__(self, index: Tensor) -> SparseDepth:
-        """Return the pixels selected by a mask or an index tensor."""
-        return SparseDepth(*(getattr(self, f.name)[index] for f in fields(self)))
-
-    def to(self, device: torch.device | str) -> SparseDepth:
-        """Return the pixels on `device`."""
-        return SparseDepth(*(getattr(self, f.name).to(device) for f in fields(self)))
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.cameras.poses import Placement, rotation_between
+from nerfloom.cameras.poses import UP, Placement, rotation_between
 from nerfloom.cameras.scale import Scale
 from nerfloom.edit.similarity import Similarity
 from nerfloom.export.run_gaussians import finite, moment_of
@@ -19,9 +19,6 @@ from nerfloom.splats.placed_files import capture_cameras, in_input, write_placed
 from nerfloom.splats.spz_container import SpzVersion
 from nerfloom.splats.transform import transformed, transformed_in_float64
 from nerfloom.training.loaded import Loaded
-
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-"""The up direction of scenes, and of Gaussians that have been set up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +135,7 @@ class Edited:
     @property
     def upwards(self) -> Tensor:
         """Direction (3,) float64 of their frame that is up, of unit length."""
-        found = self.placement.original_directions(UP[None])[0] if self.up is None else self.up
+        found = self.placement.up if self.up is None else self.up
         return found / found.norm()
 
     @property

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
-from nerfloom.cameras.poses import looked_at, rotation_between
+from nerfloom.cameras.poses import UP, looked_at, rotation_between
 from nerfloom.cameras.scale import checked
-from nerfloom.edit.edited import UP, Edited
+from nerfloom.edit.edited import Edited
 from nerfloom.edit.similarity import Similarity, about, axis_rotation, direction, vector
 from nerfloom.geometry.alignment import align
 from nerfloom.geometry.floor import Plane, find_floor, size_of

@@ -24,11 +24,10 @@ from nerfloom.cameras.view import View, every
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import composite
 from nerfloom.evaluation.appearance import held_out_appearance, right_half
-from nerfloom.evaluation.diffuse import diffuse_psnr
 from nerfloom.evaluation.lpips import MIN_SIDE_OF_LPIPS, NETWORK, Lpips, load_lpips
 from nerfloom.evaluation.metrics import MIN_SIDE_OF_SCALES, ms_ssim, psnr, quick_ssim
-from nerfloom.evaluation.normals import normal_mae
 from nerfloom.evaluation.statistics import statistics
+from nerfloom.evaluation.true_outputs import diffuse_psnr, normal_mae
 from nerfloom.evaluation.view_files import Judged, ViewFiles
 from nerfloom.kernels.images.ssim import WINDOW
 from nerfloom.renderable import Renderable, RendersFromImages

@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 from nerfloom.base.console import track
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.poses import Placement
+from nerfloom.geometry.records import TensorRows
 from nerfloom.geometry.triangles import area_vectors, draw_on_triangles, nearest_on_triangles
 
 DENSE = 800_000
@@ -72,7 +73,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(TensorRows):
     """N points of a surface."""
 
     positions: Tensor
@@ -81,12 +82,6 @@ class Samples:
     """(N, 3) unit normals; None if unknown."""
     spacing: float = 0.0
     """Distance between neighbours: the square root of the area for each point, on average."""
-
-    def __getitem__(self, kept: Tensor) -> Samples:
-        """Return the points selected by a mask or an index tensor."""
-        return replace(
-            self, positions=self.positions[kept], normals=None if self.normals is None else self.normals[kept]
-        )
 
     def placed(self, placement: Placement) -> Samples:
         """Return points of the input's frame in the scene's frame, float32."""

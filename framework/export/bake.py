@@ -139,7 +139,8 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
             fitted.append(fitted_colors(field_colors(model, own, level.cell), own, part, degree))
     coefficients = torch.cat(fitted)
     if settings.seconds > 0:
-        depths, coefficients = learnt(layout, raw, coefficients, dataset.drawing(seen.pixels), settings.seconds)
+        drawn, robust = dataset.drawing(seen.pixels), loaded.run.config.robust
+        depths, coefficients = learnt(layout, raw, coefficients, drawn, settings.seconds, robust)
     return layout, depths, coefficients
 
 
@@ -180,7 +181,7 @@ def _visible(
 
 
 def learnt(
-    layout: OctreeLayout, raw: Tensor, coefficients: Tensor, dataset: Dataset, seconds: float
+    layout: OctreeLayout, raw: Tensor, coefficients: Tensor, dataset: Dataset, seconds: float, robust: str
 ) -> tuple[Tensor, Tensor]:
     """Return optical depths (L,) and coefficients (L, 3 K) after learning from photographs.
 
@@ -190,8 +191,10 @@ def learnt(
         coefficients: (L, 3 K) coefficients at the start.
         dataset: the training images.
         seconds: time to learn.
+        robust: how the run leaves out what other images contradict (`RobustConfig`).
     """
-    config = replace(METHOD.config, max_seconds=seconds, max_num_iterations=None, vis="none")
+    config: Any = METHOD.config
+    config = replace(config, max_seconds=seconds, max_num_iterations=None, vis="none", robust=robust)
     trainer = Trainer(METHOD, config, dataset)
     trainer.prepare(start=False)
     model = trainer.model

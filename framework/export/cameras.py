@@ -15,12 +15,11 @@ from nerfloom.base.splits import Split
 from nerfloom.cameras.cameras import Cameras, join_cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.parsed_scene import ParsedScene
+from nerfloom.geometry.alignment import nearest_rotations
 from nerfloom.geometry.lenses import LENSES
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 """Splits, in the order of their images in the file."""
-ORTHONORMAL_STEPS = 2
-"""Newton steps that make a rotation orthonormal in float64; from float32, one is enough."""
 
 
 def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) -> list[dict[str, Any]]:
@@ -32,14 +31,7 @@ def camera_list(cameras: Cameras, names: Sequence[str], placement: Placement) ->
 def input_poses(cameras: Cameras, placement: Placement) -> Tensor:
     """Return the M poses (3, 4) of `cameras` in the input's frame by `placement`, float64, rotations orthonormal."""
     poses = placement.original_poses(cameras.camera_to_worlds.cpu())
-    return torch.cat([orthonormal(poses[:, :, :3]), poses[:, :, 3:]], -1)
-
-
-def orthonormal(rotations: Tensor) -> Tensor:
-    """Return the orthonormal matrices nearest to `rotations` (..., 3, 3) float64, which are nearly so: Higham 1986."""
-    for _ in range(ORTHONORMAL_STEPS):
-        rotations = (rotations + torch.linalg.inv(rotations).transpose(-1, -2)) / 2
-    return rotations
+    return torch.cat([nearest_rotations(poses[:, :, :3]), poses[:, :, 3:]], -1)
 
 
 @dataclass(frozen=True)

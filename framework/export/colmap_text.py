@@ -6,11 +6,11 @@ import os
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import ConfigError
 from nerfloom.export.cameras import PosedFiles, coefficients, rational
+from nerfloom.splats.transform import quaternion
 
 ORDERS = {
     "PINHOLE": (),
@@ -77,17 +77,3 @@ def _cameras(posed: PosedFiles) -> tuple[list[str], list[int]]:
         owners.append(numbers.setdefault(line, len(numbers)))
     header = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
     return [header, *(f"{number + 1} {line}" for line, number in numbers.items())], owners
-
-
-def quaternion(rotation: Tensor) -> Tensor:
-    """Return the unit quaternion (4,) w, x, y, z with w >= 0 of a `rotation` (3, 3), float64: Bar-Itzhack 2000.
-
-    It is the eigenvector of a symmetric matrix, which is well conditioned for every rotation.
-    """
-    r = rotation.double()
-    k = torch.zeros(4, 4, dtype=torch.float64)
-    k[0, 0] = r.trace()
-    k[1:, 1:] = r + r.T - r.trace() * torch.eye(3, dtype=torch.float64)
-    k[0, 1:] = k[1:, 0] = torch.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    found = torch.linalg.eigh(k / 3).eigenvectors[:, -1]
-    return -found if found[0] < 0 else found

@@ -71,6 +71,8 @@ class LatticeDensity:
         ConfigError: if the model has no density.
     """
 
+    quantity = "density"
+    """Name of what is evaluated, for messages."""
     _skipped = 0.0
     """The value in skipped cells."""
 
@@ -98,6 +100,18 @@ class LatticeDensity:
         # The values come from the opacity of a length that is half opaque at the level. Densities and their logarithms
         # are unbounded: a vertex between densities of 1 and 10^4 would always lie next to the former.
         return 1 - 2 * torch.exp(-math.log(2) / self.level * sigma)
+
+    def without_surface(self) -> str:
+        """Return why there is no surface."""
+        seen = self.seen
+        if not seen.evaluated:
+            return "there is no surface: the occupancy grid has no occupied cell in the box; is the run trained?"
+        if seen.nan == seen.evaluated:
+            return "there is no surface: the density is NaN everywhere in the box; train the run again"
+        return (
+            f"there is no surface: the density is between {seen.low:.3g} and {seen.high:.3g} per scene unit in the box "
+            f"and never passes {self.level:.4g}; set --isosurface-threshold, or another box"
+        )
 
     @staticmethod
     def _function(model: Renderable) -> Callable[[Points], Tensor]:
@@ -189,12 +203,19 @@ class LatticeDensity:
 
 
 class LatticeDistance(LatticeDensity):
-    """The signed distance of `model` at points of `lattice` at a `time`; cells that are skipped are outside."""
+    """The signed distance of `model` at points of `lattice`; cells that are skipped are outside."""
 
+    quantity = "signed distance"
     _skipped = math.inf
 
-    def __init__(self, model: Renderable, lattice: Lattice, time: float = 0.0) -> None:
-        super().__init__(model, lattice, 0.0, time)
+    def __init__(self, model: Renderable, lattice: Lattice) -> None:
+        super().__init__(model, lattice, 0.0)
+
+    def without_surface(self) -> str:
+        return (
+            "there is no surface: the signed distance does not change its sign in the box; train longer, or set "
+            "another box"
+        )
 
     @staticmethod
     def _function(model: Renderable) -> Callable[[Points], Tensor]:

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, nearest
+from nerfloom.export.occupancy import export_occupancy
+from nerfloom.export.point_cloud import export_points
+from nerfloom.export.run_cameras import export_cameras
+from nerfloom.export.run_gaussians import export_gaussians
+from nerfloom.export.run_levels import export_levels
+from nerfloom.export.run_mesh import export_fused, export_level_set
+from nerfloom.export.run_page import export_page, kind_of
 from nerfloom.export.settings import (
     CameraSettings,
     LevelsSettings,
@@ -18,13 +25,11 @@ from nerfloom.export.settings import (
     TsdfSettings,
     WebSettings,
 )
-
-if TYPE_CHECKING:
-    from nerfloom.geometry.regions import Region
-    from nerfloom.training.loaded import Loaded
-
-    Writer = Callable[[Loaded, Path, Any, Sequence[Region]], None]
-    """Function that writes a file, of the scene to export, the file, settings and regions."""
+from nerfloom.geometry.regions import Region
+from nerfloom.renderable import HasDensity, HasSignedDistance, parts
+from nerfloom.samplers.base import SkipsCells
+from nerfloom.splats.gaussians import HasGaussians
+from nerfloom.training.loaded import Loaded
 
 MESHES = (".ply", ".obj", ".glb")
 """Suffixes of meshes."""
@@ -37,8 +42,8 @@ class Kind(NamedTuple):
     """Class of its settings."""
     suffixes: tuple[str, ...]
     """Suffixes that its file may have."""
-    writer: Callable[[], Writer]
-    """Imports the function that writes the file, and returns it."""
+    write: Callable[..., None]
+    """Writes the file, given the run or file to export, the path, the settings and, if `is_cropped`, the regions."""
     suits: Callable[[Loaded], bool]
     """Returns whether a run or a file has what the export needs."""
     is_cropped: bool = False
@@ -70,7 +75,10 @@ def export(loaded: Loaded, name: str, path: Path, settings: Any, regions: Sequen
     path.parent.mkdir(parents=True, exist_ok=True)
     if loaded.scale.is_known:
         say(loaded.scale.words())
-    kind.writer()(loaded, path, settings, regions)
+    if kind.is_cropped:
+        kind.write(loaded, path, settings, regions)
+    else:
+        kind.write(loaded, path, settings)
 
 
 def check_scale(loaded: Loaded) -> None:
@@ -99,57 +107,6 @@ def kind_named(name: str) -> Kind:
     return KINDS[name]
 
 
-# Each imports on use, so that the help of the command is fast.
-
-
-def _points() -> Writer:
-    from nerfloom.export.point_cloud import export_points
-
-    return export_points
-
-
-def _level_set() -> Writer:
-    from nerfloom.export.run_mesh import export_level_set
-
-    return export_level_set
-
-
-def _fused() -> Writer:
-    from nerfloom.export.run_mesh import export_fused
-
-    return export_fused
-
-
-def _gaussians() -> Writer:
-    from nerfloom.export.run_gaussians import export_gaussians
-
-    return export_gaussians
-
-
-def _levels() -> Writer:
-    from nerfloom.export.run_levels import export_levels
-
-    return export_levels
-
-
-def _cameras() -> Writer:
-    from nerfloom.export.run_cameras import export_cameras
-
-    return lambda loaded, path, settings, _: export_cameras(loaded, path, settings)
-
-
-def _occupancy() -> Writer:
-    from nerfloom.export.occupancy import export_occupancy
-
-    return lambda loaded, path, settings, _: export_occupancy(loaded, path, settings)
-
-
-def _page() -> Writer:
-    from nerfloom.export.run_page import export_page
-
-    return export_page
-
-
 # What they need; the writers say it in their errors.
 
 
@@ -158,40 +115,31 @@ def _has_photographs(loaded: Loaded) -> bool:
 
 
 def _has_surface(loaded: Loaded) -> bool:
-    from nerfloom.renderable import HasDensity, HasSignedDistance
-
     return isinstance(loaded.model, (HasDensity, HasSignedDistance)) and _has_photographs(loaded)
 
 
 def _has_gaussians(loaded: Loaded) -> bool:
-    from nerfloom.splats.gaussians import HasGaussians
-
     return isinstance(loaded.model, HasGaussians)
 
 
 def _has_cells(loaded: Loaded) -> bool:
-    from nerfloom.renderable import parts
-    from nerfloom.samplers.base import SkipsCells
-
     return bool(parts(loaded.model, SkipsCells))
 
 
 def _has_page(loaded: Loaded) -> bool:
-    from nerfloom.export.run_page import kind_of
-
     return kind_of(loaded.model) != "gaussians" or _has_gaussians(loaded) or _has_photographs(loaded)
 
 
 KINDS: dict[str, Kind] = {
-    "pointcloud": Kind(PointSettings, (".ply",), _points, _has_photographs, is_cropped=True),
-    "marching-cubes": Kind(MarchingCubesSettings, MESHES, _level_set, _has_surface, is_cropped=True),
-    "tsdf": Kind(TsdfSettings, MESHES, _fused, _has_photographs, is_cropped=True),
+    "pointcloud": Kind(PointSettings, (".ply",), export_points, _has_photographs, is_cropped=True),
+    "marching-cubes": Kind(MarchingCubesSettings, MESHES, export_level_set, _has_surface, is_cropped=True),
+    "tsdf": Kind(TsdfSettings, MESHES, export_fused, _has_photographs, is_cropped=True),
     "gaussian-splat": Kind(
-        SplatSettings, (".ply", ".spz", ".sog", ".glb"), _gaussians, _has_gaussians, is_cropped=True
+        SplatSettings, (".ply", ".spz", ".sog", ".glb"), export_gaussians, _has_gaussians, is_cropped=True
     ),
-    "levels": Kind(LevelsSettings, (".levels",), _levels, _has_gaussians, is_cropped=True),
-    "cameras": Kind(CameraSettings, (".json",), _cameras, _has_photographs),
-    "occupancy": Kind(OccupancySettings, (".npz",), _occupancy, _has_cells),
-    "web": Kind(WebSettings, (".html",), _page, _has_page, is_cropped=True),
+    "levels": Kind(LevelsSettings, (".levels",), export_levels, _has_gaussians, is_cropped=True),
+    "cameras": Kind(CameraSettings, (".json",), export_cameras, _has_photographs),
+    "occupancy": Kind(OccupancySettings, (".npz",), export_occupancy, _has_cells),
+    "web": Kind(WebSettings, (".html",), export_page, _has_page, is_cropped=True),
 }
 """Kinds of export by name."""

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
 from nerfloom.base.console import say, track
-from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.errors import ConfigError
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.poses import Placement
 from nerfloom.data.dataset import Dataset
@@ -19,8 +20,9 @@ from nerfloom.export.colors import seen_colors, spread_colors
 from nerfloom.export.isosurface import isosurface
 from nerfloom.export.lattice import Lattice
 from nerfloom.export.mesh import Mesh, largest_components, simplified, vertex_normals, within, without_degenerate
-from nerfloom.export.seen import seen_part
-from nerfloom.export.texture import Texturing, painted
+from nerfloom.export.seen import default_min_views, seen_part
+from nerfloom.export.settings import MarchingCubesSettings, MeshSettings, TsdfSettings
+from nerfloom.export.texture import painted
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.regions import Region
 from nerfloom.kernels.math import safe_normalize
@@ -28,6 +30,8 @@ from nerfloom.renderable import HasSignedDistance, Renderable, RendersRays
 
 ColorFunction = Callable[[Tensor, Tensor], Tensor]
 """Function from vertices and normals (V, 3) in scene coordinates to colours (V, 3), NaN for a vertex without."""
+Onto = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Function that moves vertices (V, 3) onto a surface, and returns them and their normals (V, 3)."""
 COLOURED = 2**16
 """Number of vertices that are coloured at once."""
 ROUNDING = 1e-4
@@ -36,97 +40,48 @@ NEWTON_STEPS, LEAST_SLOPE = 3, 0.1
 """Number of Newton steps onto a surface, and the minimum length of a gradient that a step divides by."""
 
 
-@dataclass(frozen=True)
-class Cleaning:
-    """The parts of a surface that are kept."""
-
-    num_components: int = 0
-    """Maximum number of connected components; 0 for any."""
-    min_component_share: float = 0.001
-    """Minimum number of faces of a component, relative to the largest component."""
-    target_num_faces: int | None = None
-    """Number of faces that the mesh is simplified to; None for no simplification."""
-    min_views: int = 0
-    """Minimum number of training cameras that see a face; 0 for any (`default_min_views`)."""
-    regions: tuple[Region, ...] = ()
-    """Regions; the mesh keeps their intersection, scene coordinates; none for everything on the lattice."""
-
-    def check(self) -> None:
-        """Raise ConfigError if a number is out of range."""
-        if self.min_views < 0:
-            raise FlagError(f"--min-views is {self.min_views}; it must be at least 0")
-        if self.num_components < 0 or not 0 <= self.min_component_share <= 1:
-            raise FlagError("--num-components must be at least 0, and --min-component-share from 0 to 1")
-        if self.target_num_faces is not None and self.target_num_faces < 4:
-            raise FlagError(f"--target-num-faces is {self.target_num_faces}; it must be at least 4")
-
-
-def density_mesh(
+def level_set_mesh(
     model: Renderable,
     lattice: Lattice,
-    level: float,
-    time: float,
     cameras: Cameras,
-    cleaning: Cleaning,
-    texturing: Texturing | None = None,
+    settings: MarchingCubesSettings,
+    regions: Sequence[Region] = (),
 ) -> Mesh:
-    """Return the isosurface of a model's density, in scene coordinates.
+    """Return the surface where a model's signed distance is 0, or else where its density passes a level.
+
+    Vertices on a signed distance are moved onto the surface by Newton steps, and normals are its gradients.
 
     Args:
         model: the model in evaluation mode.
-        lattice: where the density is evaluated.
-        level: the density, 1/scene unit.
-        time: time in [0, 1] of a scene that moves.
+        lattice: where the distance or the density is evaluated.
         cameras: the training cameras.
-        cleaning: which parts are kept.
-        texturing: settings of the texture; None for none.
+        settings: settings of the mesh; an open level of density is `default_level`.
+        regions: the mesh keeps their intersection, scene coordinates; none for everything on the lattice.
+
+    Returns:
+        The mesh in scene coordinates.
 
     Raises:
-        ConfigError: if the model has no density, or there is no surface; the message says why.
+        ConfigError: if the model has neither, or there is no surface; the message says why.
     """
-    field = density.LatticeDensity(model, lattice, level, time)
+    field: density.LatticeDensity
+    onto: Onto | None = None
+    if isinstance(model, HasSignedDistance):
+        field, onto = density.LatticeDistance(model, lattice), partial(_onto, model, lattice)
+    else:
+        level = settings.isosurface_threshold
+        level = density.default_level(model.scene.box) if level is None else level
+        field = density.LatticeDensity(model, lattice, level, settings.time)
     blocks = field.blocks()
     found = isosurface(lattice, density.BLOCK, track(field.valued(blocks), "Looking for the surface", len(blocks)))
-    seen = field.seen
-    if seen.nan:
-        say(f"warning: the density is NaN at {seen.nan:,} of {seen.evaluated:,} positions; there the mesh has holes")
+    if nan := field.seen.nan:
+        of_all = f"{nan:,} of {field.seen.evaluated:,} positions"
+        say(f"warning: the {field.quantity} is NaN at {of_all}; there the mesh has holes")
     if not len(found[1]):
-        raise ConfigError(_without_surface(seen, level))
-    return _finished(found, lattice, cameras, cleaning, _colors(model, lattice, time), texturing)
-
-
-def distance_mesh(
-    model: Renderable,
-    lattice: Lattice,
-    cameras: Cameras,
-    cleaning: Cleaning,
-    texturing: Texturing | None = None,
-) -> Mesh:
-    """Return the surface where a model's signed distance is 0, in scene coordinates.
-
-    Vertices of marching cubes are moved onto the surface by Newton steps, and normals are the distance's gradients.
-
-    Args:
-        model: the model in evaluation mode, which has a signed distance.
-        lattice: where the distance is evaluated.
-        cameras: the training cameras.
-        cleaning: which parts are kept.
-        texturing: settings of the texture; None for none.
-
-    Raises:
-        ConfigError: if there is no surface.
-    """
-    field = density.LatticeDistance(model, lattice)
-    blocks = field.blocks()
-    found = isosurface(lattice, density.BLOCK, track(field.valued(blocks), "Looking for the surface", len(blocks)))
-    if not len(found[1]):
-        raise ConfigError(
-            "there is no surface: the signed distance does not change its sign in the box; train longer, or set "
-            "another box"
-        )
-    return _finished(
-        found, lattice, cameras, cleaning, _colors(model, lattice, 0.0), texturing, partial(_onto, model, lattice)
-    )
+        raise ConfigError(field.without_surface())
+    least = default_min_views(model) if settings.min_views is None else settings.min_views
+    visible = seen_part(_mesh(found, lattice), cameras, least)
+    return _finished(visible, lattice, cameras, settings, regions, _colors(model, lattice, field.time), onto)
 
 
 def _onto(model: Renderable, lattice: Lattice, vertices: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,10 +117,8 @@ def fused_mesh(
     model: Renderable,
     dataset: Dataset,
     lattice: Lattice,
-    truncation: float,
-    views: int,
-    cleaning: Cleaning,
-    texturing: Texturing | None = None,
+    settings: TsdfSettings,
+    regions: Sequence[Region] = (),
 ) -> Mesh:
     """Return the surface that the rendered depth images of the training views agree on, in scene coordinates.
 
@@ -173,21 +126,18 @@ def fused_mesh(
         model: the model in evaluation mode.
         dataset: the training split, on the model's device.
         lattice: where distances are fused.
-        truncation: truncation distance, in cells.
-        views: maximum number of views, evenly spaced in the data set.
-        cleaning: which parts are kept.
-        texturing: settings of the texture; None for none.
+        settings: settings of the mesh.
+        regions: as in `level_set_mesh`.
 
     Raises:
         ConfigError: if no view sees a surface in the box.
     """
-    chosen = torch.linspace(0, len(dataset) - 1, min(views, len(dataset)), dtype=torch.float64).round().long()
-    chosen = chosen.to(dataset.device)
+    chosen = torch.tensor(evenly_spread(len(dataset), settings.max_num_views), device=dataset.device)
     cameras, times = dataset.cameras[chosen], None if dataset.times is None else dataset.times[chosen]
     stride = tsdf.stride_for(cameras, lattice)
     rendered = tsdf.rendered_views(model, cameras, times, model.background, stride)
     depths = list(track(rendered, "Rendering depth", total=len(cameras)))
-    fused = tsdf.FusedDistance(lattice, depths, truncation)
+    fused = tsdf.FusedDistance(lattice, depths, settings.truncation)
     blocks = fused.blocks()
     if not blocks:
         raise ConfigError(
@@ -196,7 +146,8 @@ def fused_mesh(
     found = isosurface(lattice, tsdf.BLOCK, track(fused.valued(blocks), "Fusing depth", total=len(blocks)))
     if not len(found[1]):
         raise ConfigError("the training views agree on no surface in the box; a larger --truncation may find one")
-    return _finished(found, lattice, dataset.cameras, cleaning, fused.colors, texturing)
+    visible = seen_part(_mesh(found, lattice), dataset.cameras, settings.min_views or 0)  # no view has fused the rest
+    return _finished(visible, lattice, dataset.cameras, settings, regions, fused.colors)
 
 
 def in_input(mesh: Mesh, placement: Placement) -> Mesh:
@@ -205,30 +156,31 @@ def in_input(mesh: Mesh, placement: Placement) -> Mesh:
     return replace(mesh, vertices=placement.original_points(mesh.vertices), normals=normals)
 
 
+def _mesh(found: tuple[Tensor, Tensor], lattice: Lattice) -> Mesh:
+    """Return a surface in lattice coordinates as a mesh in scene coordinates."""
+    return without_degenerate(Mesh(lattice.positions(found[0]), found[1]))
+
+
 def _finished(
-    found: tuple[Tensor, Tensor],
+    mesh: Mesh,
     lattice: Lattice,
     cameras: Cameras,
-    cleaning: Cleaning,
+    settings: MeshSettings,
+    regions: Sequence[Region],
     colors: ColorFunction,
-    texturing: Texturing | None,
-    onto: Callable[[Tensor], tuple[Tensor, Tensor]] | None = None,
+    onto: Onto | None = None,
 ) -> Mesh:
-    """Return the cleaned mesh of a surface in lattice coordinates, with normals, colours and perhaps a texture.
-
-    `onto` moves vertices onto the surface and returns their normals; None for normals of the faces.
-    """
-    visible = seen_part(without_degenerate(Mesh(lattice.positions(found[0]), found[1])), cameras, cleaning.min_views)
+    """Return the cleaned mesh, with normals, of the faces without `onto`, with colours and perhaps a texture."""
     # Vertices on a face of a region are in it, however they are rounded.
-    mesh = within(visible, [region.grown(ROUNDING * lattice.spacing) for region in cleaning.regions])
+    mesh = within(mesh, [region.grown(ROUNDING * lattice.spacing) for region in regions])
     eyes = cameras.camera_to_worlds[:, :, 3].double().cpu()
-    mesh, dropped = largest_components(mesh, cleaning.num_components, cleaning.min_component_share, eyes)
+    mesh, dropped = largest_components(mesh, settings.num_components, settings.min_component_share, eyes)
     if not len(mesh.faces):
         raise ConfigError("the surface bounds only cavities; another --isosurface-threshold may find more")
     if dropped:
         say(f"{dropped:,} small or hidden pieces are left out (--num-components, --min-component-share)")
-    if cleaning.target_num_faces is not None:
-        mesh = simplified(mesh, cleaning.target_num_faces)
+    if settings.target_num_faces is not None:
+        mesh = simplified(mesh, settings.target_num_faces)
     if onto is None:
         normals = vertex_normals(mesh)
     else:
@@ -237,17 +189,7 @@ def _finished(
     pieces = list(zip(mesh.vertices.split(COLOURED), normals.split(COLOURED), strict=True))
     seen = [colors(*piece) for piece in track(pieces, "Colouring the vertices", total=len(pieces))]
     of_vertices = spread_colors(torch.cat(seen), mesh.faces)
-    texture = painted(mesh.vertices, normals, of_vertices, mesh.faces, colors, texturing) if texturing else None
+    texture, size = None, settings.texture_size
+    if size is not None:
+        texture = painted(mesh.vertices, normals, of_vertices, mesh.faces, colors, size, settings.texture_seconds)
     return replace(mesh, normals=normals, colors=of_vertices, texture=texture)
-
-
-def _without_surface(seen: density.DensityRange, level: float) -> str:
-    """Return why the density has no surface."""
-    if not seen.evaluated:
-        return "there is no surface: the occupancy grid has no occupied cell in the box; is the run trained?"
-    if seen.nan == seen.evaluated:
-        return "there is no surface: the density is NaN everywhere in the box; train the run again"
-    return (
-        f"there is no surface: the density is between {seen.low:.3g} and {seen.high:.3g} per scene unit in the box and "
-        f"never passes {level:.4g}; set --isosurface-threshold, or another box"
-    )

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import track
+from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_pixels
+from nerfloom.geometry.records import TensorRows
 from nerfloom.renderable import Renderable, RendersRays
 from nerfloom.rendering.outputs import NORMALS
 
@@ -23,7 +25,7 @@ MAX_VIEWS = 200
 
 
 @dataclass(frozen=True)
-class SurfacePoints:
+class SurfacePoints(TensorRows):
     """K points on surfaces, scene coordinates."""
 
     positions: Tensor
@@ -36,11 +38,6 @@ class SurfacePoints:
     """(K, 3) unit directions of the rays that ended there."""
     pixels: Tensor
     """(K,) int64 numbers of their pixels, counted through all images."""
-
-    def __getitem__(self, kept: Tensor) -> SurfacePoints:
-        """Return the points selected by a mask or an index tensor."""
-        normals = None if self.normals is None else self.normals[kept]
-        return SurfacePoints(self.positions[kept], self.colors[kept], normals, self.directions[kept], self.pixels[kept])
 
 
 @torch.no_grad()
@@ -108,7 +105,7 @@ def picture_points(model: Renderable, dataset: Dataset, count: int, reach: float
         reach: as in `surface_points`.
     """
     background, far = model.background, model.scene.far
-    views = torch.linspace(0, len(dataset) - 1, num_views(dataset), dtype=torch.float64).round().long().tolist()
+    views = evenly_spread(len(dataset), MAX_VIEWS)
     for number, index in enumerate(views):
         view = replace(dataset.view(index), image=None)
         picture = model.render_view(view, background)

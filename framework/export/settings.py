@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+from nerfloom.base.errors import FlagError
+
+MIN_TEXTURE, MAX_TEXTURE = 64, 16_384
+"""Bounds of a texture's edge, in texels."""
 PageKind = Literal["gaussians", "octree"]
 """Content of a web page."""
 
@@ -112,6 +117,23 @@ class MeshSettings:
     texture_seconds: float = 300.0
     """Maximum seconds for the texture; the rest of it gets the vertices' colours."""
 
+    def check_ranges(self) -> None:
+        """Check all numbers.
+
+        Raises:
+            FlagError: if one is out of range.
+        """
+        if self.min_views is not None and self.min_views < 0:
+            raise FlagError(f"--min-views is {self.min_views}; it must be at least 0")
+        if self.num_components < 0 or not 0 <= self.min_component_share <= 1:
+            raise FlagError("--num-components must be at least 0, and --min-component-share from 0 to 1")
+        if self.target_num_faces is not None and self.target_num_faces < 4:
+            raise FlagError(f"--target-num-faces is {self.target_num_faces}; it must be at least 4")
+        if self.texture_size is not None and not MIN_TEXTURE <= self.texture_size <= MAX_TEXTURE:
+            raise FlagError(f"--texture-size is {self.texture_size}; it must be from {MIN_TEXTURE} to {MAX_TEXTURE}")
+        if not self.texture_seconds > 0:
+            raise FlagError(f"--texture-seconds is {self.texture_seconds:g}; it must be above zero")
+
 
 @dataclass(frozen=True, kw_only=True)
 class MarchingCubesSettings(MeshSettings):
@@ -125,6 +147,13 @@ class MarchingCubesSettings(MeshSettings):
     time: float = 0.0
     """Time of a moving scene, 0 to 1."""
 
+    def check_ranges(self) -> None:
+        super().check_ranges()
+        if self.isosurface_threshold is not None and not 0 < self.isosurface_threshold < math.inf:
+            raise FlagError(f"--isosurface-threshold is {self.isosurface_threshold:g}; it must be above zero")
+        if not 0 <= self.time <= 1:
+            raise FlagError(f"--time is {self.time:g}; it must be from 0 to 1")
+
 
 @dataclass(frozen=True, kw_only=True)
 class TsdfSettings(MeshSettings):
@@ -135,3 +164,8 @@ class TsdfSettings(MeshSettings):
     parts."""
     max_num_views: int = 200
     """Maximum number of rendered training views, evenly spaced."""
+
+    def check_ranges(self) -> None:
+        super().check_ranges()
+        if self.max_num_views < 1:
+            raise FlagError(f"--max-num-views is {self.max_num_views}; it must be at least 1")

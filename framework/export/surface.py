@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Literal
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.export.density import default_level
 from nerfloom.export.lattice import lattice_of
 from nerfloom.export.mesh import Mesh
-from nerfloom.export.meshing import Cleaning, density_mesh, distance_mesh, fused_mesh, in_input
-from nerfloom.export.seen import default_min_views
-from nerfloom.export.settings import TsdfSettings
+from nerfloom.export.meshing import fused_mesh, in_input, level_set_mesh
+from nerfloom.export.settings import MarchingCubesSettings, TsdfSettings
 from nerfloom.renderable import HasDensity, HasSignedDistance, Renderable
 from nerfloom.training.loaded import Loaded
 
@@ -58,13 +56,8 @@ def surface_mesh(
         raise ConfigError("this scene moves: export the mesh of one time (ns-export), and pass it as --mesh")
     lattice = lattice_of(model.scene.box, resolution, loaded.placement, low, high)
     if kind == "tsdf":
-        defaults = TsdfSettings.truncation, TsdfSettings.max_num_views
-        mesh = fused_mesh(model, loaded.dataset("train"), lattice, *defaults, Cleaning())
+        mesh = fused_mesh(model, loaded.dataset("train"), lattice, TsdfSettings())
     else:
-        cameras = loaded.parsed("train").cameras
-        if isinstance(model, HasSignedDistance):
-            least = 0 if whole else default_min_views(model)
-            mesh = distance_mesh(model, lattice, cameras, Cleaning(min_views=least))
-        else:
-            mesh = density_mesh(model, lattice, default_level(model.scene.box), 0.0, cameras, Cleaning())
+        settings = MarchingCubesSettings(min_views=0 if whole else None)
+        mesh = level_set_mesh(model, lattice, loaded.parsed("train").cameras, settings)
     return in_input(mesh, loaded.placement)

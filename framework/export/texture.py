@@ -16,31 +16,12 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import say, track
-from nerfloom.base.errors import ConfigError, FlagError
+from nerfloom.base.errors import ConfigError
 
-MIN_EDGE, MAX_EDGE = 64, 16_384
-"""Bounds of a texture's edge, in texels."""
 MIN_SQUARE = 5
 """Minimum edge of a square, in texels: the legs of its triangles are three shorter."""
 CHUNK = 1 << 17
 """Maximum number of texels that are coloured at once."""
-
-
-@dataclass(frozen=True)
-class Texturing:
-    """The size of a texture, and the time that it may take."""
-
-    size: int
-    """Edge of the image, texels."""
-    max_seconds: float
-    """Time limit, seconds. Remaining texels then get the colours of the vertices."""
-
-    def check(self) -> None:
-        """Raise ConfigError if a number is out of range."""
-        if not MIN_EDGE <= self.size <= MAX_EDGE:
-            raise FlagError(f"--texture-size is {self.size}; it must be from {MIN_EDGE} to {MAX_EDGE}")
-        if not self.max_seconds > 0:
-            raise FlagError(f"--texture-seconds is {self.max_seconds:g}; it must be above zero")
 
 
 @dataclass(frozen=True)
@@ -129,7 +110,8 @@ def painted(
     vertex_colors: Tensor,
     faces: Tensor,
     colors: Callable[[Tensor, Tensor], Tensor],
-    texturing: Texturing,
+    size: int,
+    max_seconds: float,
 ) -> Texture:
     """Return a texture that has, at each texel, the colour of the surface there.
 
@@ -139,16 +121,17 @@ def painted(
         vertex_colors: (V, 3) in [0, 1], for texels without a colour of their own.
         faces: (F, 3) int64 indices of vertices.
         colors: function from positions and normals (T, 3) to colours (T, 3), NaN where there is none.
-        texturing: settings of the texture.
+        size: edge of the image, texels.
+        max_seconds: time limit, seconds. Remaining texels then get the colours of the vertices.
 
     Raises:
         ConfigError: if the image is too small for that many faces.
     """
-    atlas = Atlas(texturing.size, len(faces))
+    atlas = Atlas(size, len(faces))
     atlas.check()
     image = torch.full((atlas.size**2, 3), 127, dtype=torch.uint8)
     step = max(CHUNK // atlas.side**2, 1) * 2
-    end, late = time.monotonic() + texturing.max_seconds, 0
+    end, late = time.monotonic() + max_seconds, 0
     chunks = range(0, len(faces), step)
     for first in track(chunks, "Painting the texture", total=len(chunks)):
         places, owners, weights = atlas.texels(first, min(first + step, len(faces)))

@@ -31,7 +31,7 @@ import nerfloom
 from nerfloom.base.errors import ConfigError, DataError, FlagError
 from nerfloom.base.evenly_spaced import strided
 from nerfloom.cameras.cameras import Cameras
-from nerfloom.cameras.poses import looked_at, rotation_between
+from nerfloom.cameras.poses import UP, looked_at, rotation_between
 from nerfloom.evaluation.paths import arc_of
 from nerfloom.splats.gaussian_limit import fitted_spz
 from nerfloom.splats.gaussians import Gaussians
@@ -121,10 +121,9 @@ def upright(cameras: Cameras, z_is_up: bool) -> Tensor:
             side.
     """
     up = cameras.camera_to_worlds[:, :, 1].double().mean(0).cpu()
-    z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     if z_is_up or float(up.norm()) < LEVEL or float(up[2]) >= LEVEL * float(up.norm()):
         return torch.eye(3, dtype=torch.float64)
-    return rotation_between(up, z)
+    return rotation_between(up, UP)
 
 
 def held_upright(cameras: Cameras) -> Cameras:

@@ -6,17 +6,18 @@ scene units, sigma density in 1/length, T transmittance, w weight.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from nerfloom.geometry.records import TensorRows
+
 
 @dataclass(frozen=True)
-class Rays:
+class Rays(TensorRows):
     """A batch of R rays. Every tensor is indexed by ray; optional ones are None if unknown."""
 
     origins: Tensor
@@ -46,23 +47,9 @@ class Rays:
     def __len__(self) -> int:
         return self.origins.shape[0]
 
-    def __getitem__(self, index: Tensor | slice) -> Rays:
-        """Return the rays selected by a slice, a mask or an index tensor."""
-        return self._map(lambda values: values[index])
-
-    def to(self, device: torch.device | str) -> Rays:
-        """Return the rays on `device`."""
-        return self._map(lambda values: values.to(device))
-
     def detached(self) -> Rays:
         """Return the rays without a gradient."""
-        return self._map(lambda values: values.detach())
-
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Rays:
-        """Apply a function to every tensor."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {name: change(value) for name, value in values.items() if isinstance(value, Tensor)}
-        return replace(self, **changed)
+        return self.map(lambda values: values.detach())
 
     def points(self, ray_indices: Tensor, t: Tensor) -> Tensor:
         """Return positions along rays.

@@ -35,15 +35,7 @@ class Octree:
 
     def to(self, device: torch.device | str) -> Octree:
         """Return the octree on `device`."""
-        return Octree(
-            self.layout.to(device),
-            self.leaves.to(device),
-            self.placement,
-            self.near,
-            self.far,
-            self.has_alpha,
-            self.image_size,
-        )
+        return replace(self, layout=self.layout.to(device), leaves=self.leaves.to(device))
 
     @property
     def degree(self) -> int:

@@ -92,13 +92,11 @@ class Carved(Protocol, metaclass=SeesRegistered):
 
 
 @runtime_checkable
-class SkipsCells(Carved, Protocol, metaclass=SeesRegistered):
+class SkipsCells(Carved, StopsEarly, Protocol, metaclass=SeesRegistered):
     """A sampler that skips the empty cells of a grid (`Occupancy`)."""
 
     occupied: Tensor
     """(L n^3,) or (T n^3,) bool, True for cells that are sampled, in the order of `carved`."""
-    early_stop: float
-    """Transmittance below which the rest of a ray is dropped, as in `StopsEarly`."""
 
     def occupied_when(self, time: float | None = None) -> Tensor:
         """Return the cells (L n^3,) that are occupied in the time slice of `time`; at any time if it is None."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.errors import DataError
-from nerfloom.cameras.poses import NEAR, Placement, rotation_between
+from nerfloom.cameras.poses import NEAR, UP, Placement, rotation_between
 from nerfloom.data.scene import Scene
 from nerfloom.splats.gaussians import Gaussians
 
@@ -22,10 +22,6 @@ OUTSIDE = 0.01
 """A scene counts as unbounded if more than this share of the Gaussians is farther than 1 from the origin."""
 IMAGE_SIZE = 800
 """Longer side of rendered pictures, pixels."""
-
-
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-"""The up direction of scenes."""
 
 
 def direction_of(axis: Axis) -> Tensor:

@@ -15,6 +15,7 @@ from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.cameras.view import View
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import draw_batch
+from nerfloom.evaluation.error_bound import limited_error
 from nerfloom.gaussian_model import GaussianModel
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.march.occupancy import own_cells
@@ -93,9 +94,9 @@ def _sampling_rungs(trainer: Trainer, model: RayModel[Any], samplers: list[Skips
     tracers = parts(model, FirstCrossing)
     with _tracing(tracers, False):
         usual, count = _probe(model, rays)
-        with _changed(samplers, early_stop=0.0):
+        with limited_error(model, 0.0):
             unhidden, visible_count = _probe(model, rays)
-            with _changed(samplers, occupied=True):
+            with _all_occupied(samplers):
                 everywhere, all_count = _probe(model, rays)
     nested = any(s.levels > 1 for s in samplers)
     where = "all cells" if nested else "the box"
@@ -184,20 +185,16 @@ def _probe(model: RayModel[Any], rays: Rays) -> tuple[float, int]:
 
 
 @contextmanager
-def _changed(samplers: list[SkipsCells], early_stop: float | None = None, occupied: bool = False) -> Iterator[None]:
-    """Change early stop, or mark all cells occupied, within a `with` block."""
-    before = [(s.early_stop, s.occupied.clone()) for s in samplers]
+def _all_occupied(samplers: list[SkipsCells]) -> Iterator[None]:
+    """Mark all cells occupied within a `with` block."""
+    before = [sampler.occupied.clone() for sampler in samplers]
     try:
         for sampler in samplers:
-            if early_stop is not None:
-                sampler.early_stop = early_stop
-            if occupied:
-                sampler.occupied.fill_(True)
+            sampler.occupied.fill_(True)
             sampler.forget()
         yield
     finally:
-        for sampler, (stop, cells) in zip(samplers, before, strict=True):
-            sampler.early_stop = stop
+        for sampler, cells in zip(samplers, before, strict=True):
             sampler.occupied.copy_(cells)
             sampler.forget()
 

@@ -15,7 +15,7 @@ from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.machine_config import MachineConfig
 from nerfloom.cameras.camera_path import CameraPath
 from nerfloom.cameras.kept_cameras import read_cameras
-from nerfloom.cameras.poses import Placement
+from nerfloom.cameras.poses import UP, Placement
 from nerfloom.cameras.scale import Scale, read_scale
 from nerfloom.data.offsets import offset_file, read_offset
 from nerfloom.data.parsed_scene import ParsedScene
@@ -24,7 +24,7 @@ from nerfloom.geometry.local_origin import local_origin, rounding
 from nerfloom.splats.drawn import DrawnGaussians
 from nerfloom.splats.files import read_gaussians
 from nerfloom.splats.gaussians import Gaussians
-from nerfloom.splats.placement import UP, Axis, direction_of, placed_gaussians
+from nerfloom.splats.placement import Axis, direction_of, placed_gaussians
 from nerfloom.splats.transform import transformed
 from nerfloom.training.file_data import DataFormat, scene_of, source_of
 from nerfloom.training.loaded import Loaded
@@ -116,7 +116,7 @@ def _place_alone(gaussians: Gaussians, offset: Tensor, cameras: CameraPath | Non
     """Return the place of a file's Gaussians without data, where `cameras` that are kept beside it are known or not."""
     upwards = UP if up is None else direction_of(up)
     if up is None and cameras is not None and cameras.placement is not None:
-        upwards = cameras.placement.original_directions(UP[None])[0]
+        upwards = cameras.placement.up
     elif up is None:
         say("without photographs, z is assumed to point up (else: --up=-y, as in many captures, or --data DIR)")
     frame, scene = placed_gaussians(gaussians, upwards)

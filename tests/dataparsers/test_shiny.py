@@ -17,7 +17,7 @@ from nerfloom.dataparsers.blender import Blender
 from nerfloom.dataparsers.procedural.environment import make_environment
 from nerfloom.dataparsers.procedural.shiny import GOLD, MIRROR, SCENES, light_along, render_shiny, write_shiny
 from nerfloom.dataparsers.procedural.solids import poses_around
-from nerfloom.evaluation.normals import mean_angle
+from nerfloom.evaluation.true_outputs import mean_angle
 from nerfloom.kernels.color import to_srgb
 from tests.kernels.test_directional_encoding import drawn
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.diffuse_light import read_diffuse
-from nerfloom.evaluation.diffuse import diffuse_psnr, weighted_psnr
+from nerfloom.evaluation.true_outputs import diffuse_psnr, weighted_psnr
 from nerfloom.rendering.outputs import DIFFUSE
 from nerfloom.rendering.rendered import Picture
 from nerfloom.testing.scenes import ball_in_a_box

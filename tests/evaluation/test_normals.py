@@ -13,7 +13,7 @@ from torch import Tensor
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.normals import ENDING, files_beside, read_normals
-from nerfloom.evaluation.normals import mean_angle, normal_mae
+from nerfloom.evaluation.true_outputs import mean_angle, normal_mae
 from nerfloom.rendering.outputs import NORMALS
 from nerfloom.rendering.rendered import Picture
 from nerfloom.testing.scenes import ball_in_a_box

@@ -18,9 +18,11 @@ from nerfloom.dataparsers.colmap import Colmap, read_images
 from nerfloom.dataparsers.colmap_model import read_model
 from nerfloom.dataparsers.nerfstudio import Nerfstudio
 from nerfloom.dataparsers.reading import read_pose
-from nerfloom.export.cameras import PosedFiles, orthonormal, posed_files
-from nerfloom.export.colmap_text import images_folder, quaternion, write_model
+from nerfloom.export.cameras import PosedFiles, posed_files
+from nerfloom.export.colmap_text import images_folder, write_model
 from nerfloom.export.transforms import transforms, write_transforms
+from nerfloom.geometry.alignment import nearest_rotations
+from nerfloom.splats.transform import quaternion
 from tests.cli.helpers import train
 
 SPLITS = ("train", "val", "test")
@@ -173,7 +175,7 @@ def test_quaternions_are_scipys() -> None:
 
 def test_rounded_rotations_become_orthonormal_again() -> None:
     turn = torch.from_numpy(Rotation.random(50, random_state=1).as_matrix())
-    found = orthonormal(turn.float().double())
+    found = nearest_rotations(turn.float().double())
     eye = torch.eye(3, dtype=torch.float64).expand(50, 3, 3)
     torch.testing.assert_close(found @ found.transpose(1, 2), eye, atol=1e-13, rtol=0)
     assert float((found - turn).abs().max()) < 1e-7

@@ -14,7 +14,8 @@ from nerfloom.cameras.cameras import Cameras
 from nerfloom.export.density import LatticeDensity, default_level
 from nerfloom.export.lattice import lattice_of
 from nerfloom.export.mesh import closedness
-from nerfloom.export.meshing import Cleaning, density_mesh
+from nerfloom.export.meshing import level_set_mesh
+from nerfloom.export.settings import MarchingCubesSettings
 from nerfloom.geometry.points import Points
 from nerfloom.samplers.occupancy import OccupancySampler
 
@@ -47,7 +48,7 @@ def soft(positions: Tensor) -> Tensor:
 
 
 def mesh_of(model: Any, level: float, resolution: int = 40) -> Any:
-    return density_mesh(model, lattice_of(CUBE, resolution), level, 0.0, EYES, Cleaning())
+    return level_set_mesh(model, lattice_of(CUBE, resolution), EYES, MarchingCubesSettings(isosurface_threshold=level))
 
 
 @pytest.mark.parametrize("level", [3.0, 10.0, 40.0])
@@ -140,6 +141,7 @@ def test_nan_is_counted_and_leaves_a_hole(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_numbers_out_of_range_are_refused() -> None:
-    for wrong in (Cleaning(num_components=-1), Cleaning(min_component_share=2.0), Cleaning(target_num_faces=3)):
+    kind = MarchingCubesSettings
+    for wrong in (kind(num_components=-1), kind(min_component_share=2.0), kind(target_num_faces=3)):
         with pytest.raises(ConfigError, match="must be at least"):
-            wrong.check()
+            wrong.check_ranges()

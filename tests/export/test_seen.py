@@ -12,8 +12,8 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.export import seen
 from nerfloom.export.mesh import Mesh, closedness
-from nerfloom.export.meshing import Cleaning
 from nerfloom.export.seen import default_min_views, seen_faces, seen_part
+from nerfloom.export.settings import TsdfSettings
 from nerfloom.export.surface import surface_mesh
 from nerfloom.testing.ball import cameras_at
 from tests.export.test_mesh import sphere, together
@@ -84,7 +84,7 @@ def test_a_surface_that_no_camera_sees_is_an_error() -> None:
     with pytest.raises(ConfigError, match="fewer than 3 training cameras see"):
         seen_part(plate(0.0), above(2), 3)
     with pytest.raises(ConfigError, match="--min-views is -1"):
-        Cleaning(min_views=-1).check()
+        TsdfSettings(min_views=-1).check_ranges()
 
 
 @pytest.mark.medium

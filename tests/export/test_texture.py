@@ -12,7 +12,8 @@ from torch import Tensor
 from nerfloom.base.errors import ConfigError
 from nerfloom.export.mesh import Mesh, vertex_normals
 from nerfloom.export.mesh_files import write_mesh
-from nerfloom.export.texture import Atlas, Texturing, painted
+from nerfloom.export.settings import MeshSettings
+from nerfloom.export.texture import Atlas, painted
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -28,10 +29,10 @@ def by_place(points: Tensor, normals: Tensor) -> Tensor:
     return (points + 0.5).float()
 
 
-def textured(mesh: Mesh, colors: Callable[[Tensor, Tensor], Tensor], texturing: Texturing) -> Mesh:
+def textured(mesh: Mesh, colors: Callable[[Tensor, Tensor], Tensor], size: int, seconds: float) -> Mesh:
     grey = torch.full((len(mesh.vertices), 3), 0.25)
     assert mesh.normals is not None
-    texture = painted(mesh.vertices, mesh.normals, grey, mesh.faces, colors, texturing)
+    texture = painted(mesh.vertices, mesh.normals, grey, mesh.faces, colors, size, seconds)
     return replace(mesh, colors=grey, texture=texture)
 
 
@@ -80,7 +81,7 @@ def test_texels_of_some_faces_are_among_those_of_all() -> None:
 
 @pytest.mark.parametrize("kind", ["obj", "glb"])
 def test_a_file_has_the_colours_of_the_surface(kind: str, tmp_path: Path) -> None:
-    mesh = textured(ball(), by_place, Texturing(512, 60))
+    mesh = textured(ball(), by_place, 512, 60)
     write_mesh(tmp_path / f"ball.{kind}", mesh)
     expected = [f"ball.{kind}"] if kind == "glb" else ["ball.mtl", "ball.obj", "ball.png"]
     assert sorted(path.name for path in tmp_path.iterdir()) == expected
@@ -102,7 +103,7 @@ def test_texels_without_a_colour_have_that_of_the_vertices() -> None:
         torch.testing.assert_close(normals.norm(dim=-1), torch.ones(len(normals)))
         return torch.where(points[:, :1] > 0, torch.ones(len(points), 3), torch.nan)
 
-    mesh = textured(ball(), half, Texturing(256, 60))
+    mesh = textured(ball(), half, 256, 60)
     assert mesh.texture is not None
     middles = mesh.vertices[mesh.faces].mean(1)[:, 0]
     places = mesh.texture.coordinates.mean(1).numpy()
@@ -115,7 +116,7 @@ def test_the_time_limit_is_kept_and_said(capsys: pytest.CaptureFixture[str]) -> 
     def never(points: Tensor, normals: Tensor) -> Tensor:
         raise AssertionError("there was no time for this")
 
-    mesh = textured(ball(), never, Texturing(256, 1e-9))
+    mesh = textured(ball(), never, 256, 1e-9)
     assert mesh.texture is not None
     assert "320 of 320 faces" in capsys.readouterr().err
     found = looked_up(mesh.texture.image.numpy().astype(float), mesh.texture.coordinates.mean(1).numpy())
@@ -132,4 +133,4 @@ def test_an_image_that_is_too_small_is_refused_with_what_would_do() -> None:
 @pytest.mark.parametrize(("size", "seconds"), [(63, 1.0), (16_385, 1.0), (64, 0.0), (64, float("nan"))])
 def test_sizes_and_times_out_of_range_are_refused(size: int, seconds: float) -> None:
     with pytest.raises(ConfigError, match="--texture-s"):
-        Texturing(size, seconds).check()
+        MeshSettings(texture_size=size, texture_seconds=seconds).check_ranges()

@@ -22,8 +22,9 @@ from nerfloom.evaluation.evaluator import measure_view
 from nerfloom.export.cameras import camera_list, posed_files
 from nerfloom.export.colors import seen_colors
 from nerfloom.export.lattice import lattice_of
-from nerfloom.export.meshing import Cleaning, density_mesh, fused_mesh
+from nerfloom.export.meshing import fused_mesh, level_set_mesh
 from nerfloom.export.points import joined, picture_points, surface_points
+from nerfloom.export.settings import MarchingCubesSettings, TsdfSettings
 from nerfloom.geometry.points import Points
 from nerfloom.renderable import training_poses
 from nerfloom.testing.ball import RADIUS
@@ -149,9 +150,9 @@ def test_meshes_lie_on_the_ball(kind: str, loaded: Loaded) -> None:
     model, dataset = model_of(loaded), loaded.dataset("train")
     lattice = lattice_of(model.scene.box, 40)
     if kind == "density":
-        mesh = density_mesh(model, lattice, 500.0, 0.0, dataset.cameras, Cleaning())
+        mesh = level_set_mesh(model, lattice, dataset.cameras, MarchingCubesSettings(isosurface_threshold=500.0))
     else:
-        mesh = fused_mesh(model, dataset, lattice, 4.0, 200, Cleaning())
+        mesh = fused_mesh(model, dataset, lattice, TsdfSettings())
     assert mesh.colors is not None
     radii = mesh.vertices.norm(dim=-1)
     off = (radii - RADIUS).abs().mean() / lattice.spacing

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nerfloom.geometry.records import TensorRecord
+
 
 @dataclass(frozen=True)
-class PixelSet:
+class PixelSet(TensorRecord):
     """N runs of consecutive pixels, numbered over all images: K pixels in ascending order."""
 
     starts: Tensor
@@ -67,11 +69,6 @@ class PixelSet:
     def _ends(self) -> Tensor:
         """(N + 1,) first pixel after the run before each run; 0 before the first."""
         return torch.cat([torch.zeros_like(self.before[:1]), self.starts + self.before.diff()])
-
-    def to(self, device: torch.device | str) -> PixelSet:
-        """Return the set on `device`."""
-        tensors = (getattr(self, f.name) for f in fields(self))
-        return PixelSet(*(None if values is None else values.to(device) for values in tensors))  # type: ignore[arg-type]
 
     def listed(self) -> PixelSet:
         """Return the set with all pixels listed in `every`."""

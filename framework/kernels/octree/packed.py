@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
+from nerfloom.geometry.records import TensorRecord
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, TRITON, Operation
 from nerfloom.kernels.octree.layout import OctreeLayout
@@ -30,7 +31,7 @@ CODES = 256
 
 
 @dataclass(frozen=True)
-class PackedLeaves:
+class PackedLeaves(TensorRecord):
     """Leaves in bytes."""
 
     codes: Tensor
@@ -55,10 +56,6 @@ class PackedLeaves:
     def coefficients(self) -> Tensor:
         """Return the coefficients (L, 3 K) of the leaves."""
         return self.colors.float() * self.scales + self.offsets
-
-    def to(self, device: torch.device | str) -> PackedLeaves:
-        """Return the leaves on `device`."""
-        return PackedLeaves(*(values.to(device) for values in vars(self).values()))
 
 
 def trace_packed(

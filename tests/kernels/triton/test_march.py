@@ -20,7 +20,7 @@ def on_device(rays: Rays, grid: Occupancy) -> tuple[Rays, Occupancy]:
 
 
 def in_float64(rays: Rays, grid: Occupancy) -> tuple[Rays, Occupancy]:
-    return rays._map(Tensor.double), replace(grid, box=grid.box.double())
+    return rays.map(Tensor.double), replace(grid, box=grid.box.double())
 
 
 @pytest.mark.parametrize(

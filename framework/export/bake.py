@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerfloom.base.config import TrainConfig
 from nerfloom.base.console import say
 from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError
@@ -139,8 +140,8 @@ def _baked(loaded: Loaded, settings: Baking) -> tuple[OctreeLayout, Tensor, Tens
             fitted.append(fitted_colors(field_colors(model, own, level.cell), own, part, degree))
     coefficients = torch.cat(fitted)
     if settings.seconds > 0:
-        drawn, robust = dataset.drawing(seen.pixels), loaded.run.config.robust
-        depths, coefficients = learnt(layout, raw, coefficients, drawn, settings.seconds, robust)
+        drawn = dataset.drawing(seen.pixels)
+        depths, coefficients = learnt(layout, raw, coefficients, drawn, settings.seconds, loaded.run.config)
     return layout, depths, coefficients
 
 
@@ -181,7 +182,7 @@ def _visible(
 
 
 def learnt(
-    layout: OctreeLayout, raw: Tensor, coefficients: Tensor, dataset: Dataset, seconds: float, robust: str
+    layout: OctreeLayout, raw: Tensor, coefficients: Tensor, dataset: Dataset, seconds: float, run: TrainConfig
 ) -> tuple[Tensor, Tensor]:
     """Return optical depths (L,) and coefficients (L, 3 K) after learning from photographs.
 
@@ -191,10 +192,11 @@ def learnt(
         coefficients: (L, 3 K) coefficients at the start.
         dataset: the training images.
         seconds: time to learn.
-        robust: how the run leaves out what other images contradict (`RobustConfig`).
+        run: settings of the baked run. Its machine is used, and what it leaves out of photographs (`robust`).
     """
     config: Any = METHOD.config
-    config = replace(config, max_seconds=seconds, max_num_iterations=None, vis="none", robust=robust)
+    own = {"max_seconds": seconds, "max_num_iterations": None, "vis": "none"}
+    config = replace(config, **own, robust=run.robust, machine=run.machine)
     trainer = Trainer(METHOD, config, dataset)
     trainer.prepare(start=False)
     model = trainer.model

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import ConfigError, LostProcessError
+from nerfloom.base.errors import ConfigError
 from nerfloom.base.extras import install_command
 from nerfloom.base.signals import stoppable
 from nerfloom.jobs.child import GRACE
@@ -151,7 +151,7 @@ def _work(job: dict[str, Any], folder: str, environment: dict[str, str]) -> str 
 def _run(ray: Any, head: Head, waiting: list[Job], at_once: int, ledger: Ledger, stopped: threading.Event) -> None:
     """Run jobs until all have ended, the user stops them, or the head is lost."""
     work, lost = ray.remote(max_retries=0)(_work), dict.fromkeys(waiting, 0)
-    queue, running, patience = list(reversed(waiting)), dict[Any, Job](), GRACE
+    queue, running, there = list(reversed(waiting)), dict[Any, Job](), True
     try:
         while (queue or running) and not stopped.is_set():
             there = head.answers()  # without it Ray would block
@@ -172,14 +172,11 @@ def _run(ray: Any, head: Head, waiting: list[Job], at_once: int, ledger: Ledger,
                     lost[job] += 1
                     if _goes_on(job, lost[job], error, ledger):
                         queue.append(job)
-    except LostProcessError:
-        patience = 0.0  # nobody would tell when they have saved
-        raise
     finally:
         for reference in running:
             ray.cancel(reference)  # raises KeyboardInterrupt there, so that the job saves
-        if running:
-            ray.wait(list(running), num_returns=len(running), timeout=patience)
+        if running and there:  # a lost head would not tell when they have saved
+            ray.wait(list(running), num_returns=len(running), timeout=GRACE)
 
 
 def _goes_on(job: Job, lost: int, error: Exception, ledger: Ledger) -> bool:

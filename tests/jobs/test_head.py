@@ -10,7 +10,7 @@ from nerfloom.jobs import head
 
 def test_a_head_may_be_away_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [1000.0]
-    monkeypatch.setattr(head.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         one = head.Head(f"127.0.0.1:{port}")

@@ -127,10 +127,12 @@ class Evaluation:
 
     per_image: list[dict[str, Any]]
     """Name, psnr, ssim, ms_ssim, lpips, normal_mae, diffuse_psnr, floaters and rendering seconds of each image; the
-    numbers of its counted and masked pixels; and the image's reduction if images have several sizes."""
+    numbers of its counted and masked pixels; the image's reduction if images have several sizes; and the level error of
+    levels of detail."""
     results: dict[str, Any]
     """Means, standard deviations and rendering speed, with nerfstudio's keys; the number of images in each mean; the
-    numbers of counted and of masked pixels; by_size, the statistics of images of each size."""
+    numbers of counted and of masked pixels; by_size, the statistics of images of each size; and the largest level error
+    of levels of detail."""
     lpips_note: str
     """Network of LPIPS and source of its weights, or the reason for its absence."""
     eval_appearance: HeldOutAppearance | None = None
@@ -257,7 +259,8 @@ def evaluate(
     speed = {"num_rays_per_sec": rays / spent if rays else None, "fps": len(rows) / spent}  # None if no rays are cast
     counts = {"num_images": len(rows), "num_images_in_split": len(views)}
     protocol = None if appearance is None else appearance.held_out
-    results = {**statistics(rows), **speed, **counts}
+    errors = [row["level_error"] for row in rows if "level_error" in row]
+    results = {**statistics(rows), **speed, **counts, **({"max_level_error": max(errors)} if errors else {})}
     return Evaluation(rows, results, lpips_note, protocol, files.note)
 
 
@@ -314,7 +317,10 @@ def _judge(
     row["ignored_pixels"] = pair[0][..., 0].numel() - row["pixels"]
     row["normal_mae"] = normal_mae(picture, dataset, index, half)
     row["diffuse_psnr"] = diffuse_psnr(picture, dataset, index, half)
-    return row | {"floaters": floaters(picture, dataset, index)}, Judged(rgb, target, picture)
+    row["floaters"] = floaters(picture, dataset, index)
+    if picture.level_error is not None:
+        row["level_error"] = picture.level_error
+    return row, Judged(rgb, target, picture)
 
 
 def _judged(

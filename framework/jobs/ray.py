@@ -23,11 +23,12 @@ from nerfloom.base.extras import install_command
 from nerfloom.base.signals import stoppable
 from nerfloom.jobs.child import GRACE
 from nerfloom.jobs.execution import execute
+from nerfloom.jobs.head import Head
 from nerfloom.jobs.job import Failure, Job
 from nerfloom.jobs.launcher import Launcher, Ledger, nothing
 
-LOOK_EVERY = 0.2
-"""Seconds between looks at a signal of the user while jobs run."""
+LOOK_EVERY = 0.5
+"""Seconds between looks at the head of the cluster, and at a signal of the user, while jobs run."""
 MAX_LOST = 5
 """Number of workers that a job may lose before it counts as failed."""
 PASSED_ON = "NERFLOOM_"
@@ -51,6 +52,11 @@ class Ray(Launcher):
         return "Ray chose the machines, and may have run several at a time on one."
 
     def run(self, jobs: Sequence[Job], on_finished: Callable[[Job], None] = nothing) -> dict[Job, Failure]:
+        """Run every unfinished job, as in `Launcher`.
+
+        Raises:
+            LostProcessError: if the head of the cluster is lost.
+        """
         if (advice := install_command("cluster")) is not None:
             raise ConfigError(f"--launcher ray needs a package that is not installed: {advice}")
         ledger = Ledger(jobs, on_finished)
@@ -61,7 +67,8 @@ class Ray(Launcher):
             _check_shared(ray, Path(os.path.commonpath([job.log.parent for job in waiting])))
             _warn_of_room(ray, waiting)
             with stoppable() as stopped:
-                _run(ray, waiting, self.at_once or len(waiting), ledger, stopped)
+                head = Head(ray.get_runtime_context().gcs_address)
+                _run(ray, head, waiting, self.at_once or len(waiting), ledger, stopped)
         return ledger.failures
 
 
@@ -79,9 +86,11 @@ def _cluster(address: str | None) -> Iterator[Any]:
     try:
         ray.init(address or "local", **options)
     except Exception as error:  # Ray raises plain ones too, such as of a head that does not start in time
-        what = "cannot start Ray here" if address is None else f"--ray-address {address}: cannot connect"
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise ConfigError(f"{what}: {first}") from error
+        if address is None:
+            raise ConfigError(f"cannot start Ray here: {first}") from error
+        advice = "if the cluster asks for a token, set RAY_AUTH_MODE=token"
+        raise ConfigError(f"--ray-address {address}: cannot connect: {first} ({advice})") from error
     try:
         yield ray
     finally:
@@ -139,17 +148,20 @@ def _work(job: dict[str, Any], folder: str, environment: dict[str, str]) -> str 
     return execute(job, {**own, **environment}, Path(folder), threading.Event())
 
 
-def _run(ray: Any, waiting: list[Job], at_once: int, ledger: Ledger, stopped: threading.Event) -> None:
-    """Run jobs until all have ended, or the user stops them."""
+def _run(ray: Any, head: Head, waiting: list[Job], at_once: int, ledger: Ledger, stopped: threading.Event) -> None:
+    """Run jobs until all have ended, the user stops them, or the head is lost."""
     work, lost = ray.remote(max_retries=0)(_work), dict.fromkeys(waiting, 0)
-    queue, running = list(reversed(waiting)), dict[Any, Job]()
+    queue, running, there = list(reversed(waiting)), dict[Any, Job](), True
     try:
         while (queue or running) and not stopped.is_set():
-            while queue and len(running) < at_once:
+            there = head.answers()  # without it Ray would block
+            while there and queue and len(running) < at_once:
                 job = queue.pop()
                 if not lost[job]:
                     ledger.started(job)
                 running[_submitted(ray, work, job)] = job
+            if not running:
+                stopped.wait(LOOK_EVERY)  # until the head is back
             for reference in ray.wait(list(running), timeout=LOOK_EVERY)[0]:
                 job = running.pop(reference)
                 try:
@@ -163,7 +175,7 @@ def _run(ray: Any, waiting: list[Job], at_once: int, ledger: Ledger, stopped: th
     finally:
         for reference in running:
             ray.cancel(reference)  # raises KeyboardInterrupt there, so that the job saves
-        if running:
+        if running and there:  # a lost head would not tell when they have saved
             ray.wait(list(running), num_returns=len(running), timeout=GRACE)
 
 

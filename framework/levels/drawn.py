@@ -56,8 +56,7 @@ class DrawnLevels(Renderable):
         self, file: LevelsFile, placement: Placement, scene: Scene, device: torch.device, settings: DetailSettings
     ) -> None:
         self.file, self.scene, self.settings = file, scene.to(device), settings
-        self.error = self._reported = settings.level_error
-        """Level error of the last picture, pixels."""
+        self._reported = settings.level_error
         self.placement = placement
         """Placement of the file's coordinates in the scene."""
         self._device, self._to_file = device, placement.original_similarity()
@@ -84,15 +83,16 @@ class DrawnLevels(Renderable):
     @torch.no_grad()
     def render_view(self, view: View, background: Tensor) -> Picture:
         rotation, scale, _ = self._to_file
-        camera, shown = self._shown(view)
+        camera, shown, error = self._shown(view)
         picture = picture_of(shown, camera, view.stride, background, scale * self.scene.far, self.rasteriser)
         normals = picture.extras[NORMALS.name] @ rotation.to(picture.rgb)
         depth, median = picture.depth / scale, picture.median_depth / scale
-        return replace(picture, depth=depth, median_depth=median, extras={NORMALS.name: normals})
+        extras = {NORMALS.name: normals}
+        return replace(picture, depth=depth, median_depth=median, extras=extras, level_error=error)
 
     @torch.no_grad()
     def render_rgb(self, view: View, background: Tensor) -> Tensor:
-        camera, shown = self._shown(view)
+        camera, shown, _ = self._shown(view)
         return every(self.rasteriser.draw(shown, camera, background).image, view.stride)
 
     def cut(self, view: View) -> Cut:
@@ -112,8 +112,8 @@ class DrawnLevels(Renderable):
         seen = in_view(nodes.boxes, camera, tangents(moved, look.blur))
         return camera, cut_of(nodes, sizes, seen, self.settings.level_error, self.most)
 
-    def _shown(self, view: View) -> tuple[SplatCamera, Projected]:
-        """Return the camera of a view in the frame of the file, and the Gaussians on its image."""
+    def _shown(self, view: View) -> tuple[SplatCamera, Projected, float]:
+        """Return the camera of a view in the frame of the file, the Gaussians on its image, and their level error."""
         camera, cut = self._camera_and_cut(view)
         self._report(cut)
         # An invisible record comes first, so that there is one even if nothing is in view.
@@ -126,11 +126,11 @@ class DrawnLevels(Renderable):
             if projected.keys is not None:
                 keys.append(projected.keys[visible])
         # Chunks have no keys if they are sorted by distance.
-        return camera, Projected(torch.cat(records), torch.cat(keys) if len(keys) == len(records) else None)
+        shown = Projected(torch.cat(records), torch.cat(keys) if len(keys) == len(records) else None)
+        return camera, shown, cut.error
 
     def _report(self, cut: Cut) -> None:
         """Report a level error that the memory limit has made larger than before."""
-        self.error = cut.error
         if cut.error >= NEWS * self._reported and cut.error > self.settings.level_error:
             limit = f"{self.settings.memory_limit:g} MB"
             say(f"--memory-limit {limit}: a picture has a level error of {cut.error:.3g} pixels; more memory lowers it")

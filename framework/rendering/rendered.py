@@ -112,6 +112,8 @@ class Picture:
     """Declarations of `extras`, from the model (`Model.outputs`)."""
     num_rays: int = 0
     """Number of rays that were cast for the image; 0 if the method casts none."""
+    level_error: float | None = None
+    """Level error (`levels.cut`), pixels; None if the picture is not of levels of detail."""
 
     def of(self, name: str) -> Tensor:
         """Return the values (H, W, ...) of the output `name`."""

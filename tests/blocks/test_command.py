@@ -5,6 +5,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,12 +13,17 @@ import nerfloom
 from nerfloom.blocks.composed import Blocks
 from nerfloom.blocks.files import read_blocks
 from nerfloom.cameras.camera_path import read_transforms
+from nerfloom.rendering.light import STOPS, ToneLight
 from nerfloom.training.loaded import Loaded
 from nerfloom.training.run import TRANSFORMS, read_run
+from nerfloom.viewer.browser import Browser
+from nerfloom.viewer.photographs import Photographs
+from nerfloom.viewer.render_queue import RenderQueue
+from nerfloom.viewer.request import Pose, Request
 from tests.cli.helpers import called
 
 SMALL = "--num-levels 4 --max-resolution 64 --log2-table-size 12 --grid-resolution 16 --num-steps 64"
-NGP = f"instant-ngp {SMALL} --samples-per-batch 4096"
+NGP = f"instant-ngp {SMALL} --samples-per-batch 4096 --appearance tone"
 STREET = "--data-flags=--street 2 --size 24 --num-train 18 --changing-exposure True"
 SPLIT = ("--max-cameras", 12, "--min-cameras", 3, "--overlap", 0.2)
 FLAGS = ("--method", NGP, STREET, *SPLIT, "--max-num-iterations", 12, "--num-threads", 1, "--device-type", "cpu")
@@ -76,6 +82,37 @@ def test_visibility_networks_decide_which_blocks_are_drawn(town: Path, loaded: L
         assert network is not None
         assert (network.center, network.radius) == (block.center, block.radius)
         assert (block.run / "visibility.npz").is_file()
+
+
+@pytest.mark.slow
+def test_each_block_learns_the_light_of_its_own_images(town: Path, loaded: Loaded) -> None:
+    """From the exposures that the street states, relative to the block's mean."""
+    taken = loaded.run.parse("train").taken
+    assert taken is not None
+    for block in read_blocks(town / "blocks.yml").blocks:
+        light = nerfloom.load(block.run, device="cpu").model.appearance
+        assert isinstance(light, ToneLight)
+        stated = torch.tensor([taken[camera].stops for camera in block.cameras])
+        assert float(stated.std()) > 0.1
+        torch.testing.assert_close(STOPS * light.start, stated - stated.mean(), atol=1e-5, rtol=0)
+        learnt = STOPS * (light.vectors[:, 0].detach() - light.start).abs()
+        assert 0 < float(learnt.max()) < 1
+
+
+@pytest.mark.slow
+def test_the_viewer_shows_it_among_its_photographs(loaded: Loaded) -> None:
+    photographs, queue = Photographs(loaded.source, lambda: loaded.model), RenderQueue(loaded)
+    assert photographs.cameras is not None
+    assert len(photographs.cameras) == 18
+    pictures, pose = list[np.ndarray](), Pose(tuple(photographs.pose(5).flatten().tolist()), photographs.fov(5))
+    assert photographs.at(pose) == 5
+    request = Request(pose, 24, 24)
+    queue.add(1, Browser(lambda image, quality: pictures.append(image)))
+    queue.ask(1, lambda _: request)
+    while queue.draw_next() is not None or queue._browsers[1].pieces:
+        pass
+    expected = loaded.render(loaded.views("train")[5]).rgb.clamp(0, 1)
+    assert float(np.abs(pictures[-1] / 255 - expected.numpy()).mean()) < 0.005
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -42,8 +43,8 @@ def splats(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / f"x.{request.param}"
 
 
-def psnr(file: Path) -> float:
-    return json.loads(file.read_text())["results"]["psnr"]
+def psnr(evaluation: dict[str, Any]) -> float:
+    return evaluation["results"]["psnr"]
 
 
 def test_a_file_is_looked_at_as_its_gaussians_are(splats: Path) -> None:
@@ -66,13 +67,20 @@ def test_a_file_is_judged_as_its_gaussians_are(shared_tiny: Path, tmp_path: Path
     given = transformed(ball(), torch.eye(3), 0.25, -0.25 * MIDDLE)  # of radius 1 around the origin
     write_gaussians(tmp_path / "x.ply", given, look=Look(True))
     levels = exported(tmp_path / "x.ply")
-    found = []
-    for file, flags in ((tmp_path / "x.ply", ()), (levels, ("--level-error", 0)), (levels, ("--level-error", 50))):
+    found, fine, coarse, limited = [], ("--level-error", 0), ("--level-error", 50), ("--memory-limit", 0.05)
+    for file, flags in ((tmp_path / "x.ply", ()), *((levels, flags) for flags in (fine, limited, coarse))):
         done = called("ns-eval", file, "--data", shared_tiny, *flags)
         assert done.returncode == 0, done.stderr
-        found.append(psnr(file.with_suffix(".eval.json")))
-    assert found[1] == pytest.approx(found[0], abs=1e-3)
-    assert abs(found[2] - found[0]) > 1e-3
+        found.append(json.loads(file.with_suffix(".eval.json").read_text()))
+    gaussians, fine, limited, coarse = found
+    assert psnr(fine) == pytest.approx(psnr(gaussians), abs=1e-3)
+    assert abs(psnr(coarse) - psnr(gaussians)) > 1e-3
+    assert "max_level_error" not in gaussians["results"]
+    for wanted, each in ((0, fine), (50, coarse)):
+        assert [row["level_error"] for row in each["per_image"]] == [wanted] * 3
+    needed = [row["level_error"] for row in limited["per_image"]]  # by the memory, instead of the 1 pixel asked for
+    assert min(needed) >= 1
+    assert limited["results"]["max_level_error"] == max(needed) > 1
     assert "400 Gaussians, 15 chunks" in done.stderr
     assert "antialiased" in done.stderr
 

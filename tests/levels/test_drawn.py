@@ -50,7 +50,7 @@ def test_error_0_is_the_picture_of_all_gaussians(tmp_path: Path, look: Look, mod
             away = (found.of(name) - expected.of(name)).abs()
             assert float((away > 1e-5).double().mean()) < 1e-3, name
         assert float((found.rgb - expected.rgb).abs().max()) < 2 / 255
-        assert levels.error == 0
+        assert found.level_error == 0
         torch.testing.assert_close(levels.render_rgb(view, BLACK), found.rgb, atol=1e-6, rtol=0)
 
 
@@ -115,11 +115,10 @@ def test_memory_is_bounded_and_less_of_it_has_a_larger_error(
         levels, most = drawn(file, 0.5, memory), int(memory * 1e6 / (file.gaussian_size + DRAWN_SIZE))
         given = []
         for view in views:
-            levels.render_view(view, BLACK)
-            cut = levels.cut(view)
+            picture, cut = levels.render_view(view, BLACK), levels.cut(view)
             assert int(file.nodes.counts[cut.nodes].sum()) <= most
             assert levels.chunks.size <= file.gaussian_size * most <= memory * 1e6
-            assert levels.error == cut.error >= 0.5
+            assert picture.level_error == cut.error >= 0.5
             given.append(cut.error)
         errors.append(given)
         said = " ".join(capsys.readouterr().err.split())

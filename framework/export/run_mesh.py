@@ -102,7 +102,7 @@ def _prepared(
             raise ConfigError("--texture-size: a PLY file has no texture; take --format obj or --format glb")
         texturing = Texturing(settings.texture_size, settings.texture_seconds)
         texturing.check()
-    corners = bounds_of_all(regions) if regions else (None, None)
+    corners = bounds_of_all(regions) or (None, None)
     lattice = lattice_of(loaded.model.scene.box, settings.resolution, loaded.placement, *corners)
     return lattice, cleaning, texturing
 

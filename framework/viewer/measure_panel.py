@@ -65,7 +65,7 @@ class MeasurePanel:
 
     def _listen(self) -> None:
         """Begin or end to take clicks on the picture as points."""
-        self._client.scene.remove_click_callback()
+        self._client.scene.remove_click_callback(self._clicked)
         if self._picking.value is True:
             self._client.scene.on_click()(self._clicked)
             self._tell("Click the first point.")

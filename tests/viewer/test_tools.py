@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerfloom.geometry.regions import Box, read_region
+from nerfloom.geometry.regions import Box, read_regions
 from nerfloom.runs import load
 from nerfloom.splats.files import read_gaussians
 from nerfloom.training.trained import load_trained
@@ -79,13 +79,13 @@ def test_the_box_is_drawn_and_an_arrow_is_dragged(browser: Chromium, run: Path) 
         start, rise = root + 0.6 * (tip - root), 0.7 * ARROW / scale
         tab.drag(tuple(start), tuple(start + 0.7 * (tip - root)))
         tab.pause()
-        tab.press("Save the box")
+        tab.press("Save the crop")
         file = run / "crop.yaml"
         until(file.is_file)
         tick(tab, "Show the box")
         until(lambda: edge_pixels(tab) < drawn / 2)  # the ball has such colours too
         tab.close()
-    found = read_region(file)
+    (found,) = read_regions(file)
     file.unlink()
     print(f"pixels of edges: {without} without, {drawn} drawn")
     assert isinstance(found, Box)
@@ -168,7 +168,7 @@ def test_what_is_shown_is_exported_and_downloaded(browser: Chromium, shared_tiny
         tick(tab, "Crop")
         type_into(tab, "Highest corner", 2, "0")
         tab.pause()
-        tab.press("Save the box")
+        tab.press("Save the crop")
         until((tmp_path / "crop.yaml").is_file)
         tab.press("Export")
         tab.pause()
@@ -183,7 +183,7 @@ def test_what_is_shown_is_exported_and_downloaded(browser: Chromium, shared_tiny
         tab.close()
     means = read_gaussians(file).gaussians.means.double()
     assert 0 < len(means) < len(read_gaussians(shown_file).gaussians)
-    region = read_region(tmp_path / "crop.yaml")
+    (region,) = read_regions(tmp_path / "crop.yaml")
     assert region.contains(means).all()
 
 

@@ -194,7 +194,7 @@ class Polygon:
     def crossings(self, origins: Tensor, directions: Tensor) -> Tensor:
         """Return where rays meet the planes through the camera and an edge, and the plane at right angles to its view.
 
-        Between two of these distances, a ray is in the region or outside. The camera has to be a pinhole.
+        Between two of these distances, a ray is in the region or outside.
 
         Args:
             origins, directions: (R, 3).
@@ -202,7 +202,12 @@ class Polygon:
         Returns:
             (R, C + 1) distances for C corners, in no order; those behind the origin are negative, and those of a
             parallel plane infinite or NaN.
+
+        Raises:
+            ValueError: if the camera is no pinhole, so that its edges are in no planes.
         """
+        if self.model != "pinhole":
+            raise ValueError(f"a polygon of a camera of the model {self.model} has no planes")
         corners = [torch.tensor((*corner, 1.0), dtype=torch.float64) for corner in self.corners]
         pairs = zip(corners, (*corners[1:], corners[0]), strict=True)
         normals = torch.stack([*(torch.linalg.cross(*pair) for pair in pairs), torch.tensor((0.0, 0.0, 1.0)).double()])

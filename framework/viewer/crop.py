@@ -47,6 +47,24 @@ class CroppedCameras(Cameras):
         return parts[self.part] if self.part < len(parts) else replace(rays, nears=rays.fars)
 
 
+def views_within(view: View, crop: Crop | None, column: float, row: float, near: float, far: float) -> list[View]:
+    """Return a `view` with the parts of its rays within `crop`, as many as the ray of a pixel has; the nearest first.
+
+    Args:
+        view: the view.
+        crop: the crop; None for whole rays.
+        column, row: the pixel.
+        near, far: distances where whole rays start and end.
+    """
+    if crop is None:
+        return [view]
+    camera = view.camera
+    ray = camera.rays(
+        torch.zeros_like(camera.widths), camera.fx.new_tensor([column]), camera.fx.new_tensor([row]), near, far
+    )
+    return [replace(view, camera=CroppedCameras.of(camera, crop, part)) for part in range(len(parts_within(ray, crop)))]
+
+
 def parts_within(rays: Rays, crop: Crop) -> list[Rays]:
     """Return the parts of `rays` within a `crop`, at least one, the nearest first.
 

@@ -38,7 +38,7 @@ from nerfloom.training.run import Run
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
-from nerfloom.viewer.crop import CroppedCameras, parts_within, picture_within
+from nerfloom.viewer.crop import CroppedCameras, parts_within, picture_within, views_within
 from nerfloom.viewer.crop_panel import FACES, dragged, edges, middle, outward
 from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.occupancy import shown_cells
@@ -122,6 +122,9 @@ def test_parts_of_rays_are_what_is_within_polygons(crop: Crop) -> None:
     torch.testing.assert_close(given[0].nears, parts[0].nears)
     assert bool((given[1].fars > given[1].nears).any()) == (len(parts) > 1)
     assert not bool((given[2].fars > given[2].nears).any())
+    views = views_within(View(SMALL), crop, 4.0, 4.0, 0.5, 10.0)  # of the ray in the middle
+    ends = [view.camera.pixel_rays(torch.tensor([40]), 0.5, 10.0).fars for view in views]
+    torch.testing.assert_close(ends, [part.fars[40:41] for part in parts_within(rays[40:41], crop)])
 
 
 class Fog(RendersRays):

@@ -6,6 +6,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from nerfloom.geometry.regions import Box, read_regions
 from nerfloom.runs import load
@@ -94,6 +95,70 @@ def test_the_box_is_drawn_and_an_arrow_is_dragged(browser: Chromium, run: Path) 
     np.testing.assert_allclose(ends[1][:2], high[:2], atol=1e-5)
     print(f"the face rose by {ends[1][2] - 0.3:.3f} of {rise:.3f}")
     assert ends[1][2] - 0.3 == pytest.approx(rise, rel=0.2)
+
+
+def test_a_rectangle_and_an_outline_select(browser: Chromium, run: Path) -> None:
+    """What the picture shows in them is gone, or all the rest is; in the file, too."""
+    look, placement = look_of(run), load_trained(run, device_type="cpu").placement
+    rows, columns = np.mgrid[PICTURE]
+    in_rectangle = (columns > 180) & (columns < 320) & (rows > 300) & (rows < 440)
+    in_outline = (rows > 240) & (np.abs(columns - 300) < 180 * (500 - rows) / 260)
+    lines = binary_dilation(in_outline, iterations=4) & ~binary_erosion(in_outline, iterations=4)
+    with started(command("ns-viewer"), run, "--websocket-port", 18507) as (_, address):
+        tab = browser.open(address)
+        whole = shown(tab)
+        matter = np.abs(whole - 255).max(-1) > 40  # the background is white
+
+        def shown_without(gone: np.ndarray) -> None:
+            """The picture comes to be the one at first without what is gone, apart from JPEG's blocks at its edge."""
+            assert matter[gone].mean() > 0.1
+            assert matter[~gone].mean() > 0.1
+            found = shown_like(tab, np.where(gone[..., None], 255, whole))
+            left = np.abs(found - 255).max(-1) > 40
+            assert not (left & binary_erosion(gone, iterations=9)).any()
+
+        tab.press("Crop")
+        tab.pause()
+        tab.press("Draw a rectangle")
+        tab.pause()
+        tab.drag((180, 300), (320, 440))
+        until(lambda: "4 corners" in text_of(tab))
+        tab.press("Remove inside")
+        shown_without(in_rectangle)
+        tab.press("Undo")
+        shown_like(tab, whole, 50)
+        tab.press("Draw an outline")
+        for count, place in enumerate(((120, 240), (480, 240), (300, 500)), 1):
+            tab.pause()
+            tab.click(*place)
+            until(lambda count=count: f"{count} corners" in text_of(tab))
+        drawn = shown_unlike(tab, whole, 60)
+        tab.screenshot(Path("/tmp/walk64_drawn.png"))
+        tab.press("Keep inside")
+        shown_without(~in_outline)
+        until(lambda: "1 selection" in text_of(tab))
+        tab.screenshot(Path("/tmp/walk64_kept.png"))
+        kept = shown(tab)
+        tab.press("Save the crop")
+        file = run / "crop.yaml"
+        until(file.is_file)
+        points = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1
+        places = np.array([pixel_of(tab, look, point)[0] for point in points.tolist()])
+        tab.drag((300, 300), (420, 280))  # the mouse moves the camera again
+        shown_unlike(tab, kept, 40)
+        tab.screenshot(Path("/tmp/walk64_moved.png"))
+        tab.close()
+    (region,) = read_regions(file)
+    file.unlink()
+    changed = np.abs(drawn - whole).max(-1) > 40
+    print(f"pixels of the outline: {changed.sum()}")
+    assert changed.sum() > 300
+    assert not (changed & ~lines).any()
+    sides = np.abs(places[:, 0] - 300) - 180 * (500 - places[:, 1]) / 260
+    found, truth = region.contains(placement.original_points(points)).numpy(), (sides < 0) & (places[:, 1] > 240)
+    clear = (np.abs(sides) > 2) & (np.abs(places[:, 1] - 240) > 2)  # clicks are at whole pixels
+    assert 30 < truth.sum() < 270
+    np.testing.assert_array_equal(found[clear], truth[clear])
 
 
 def test_field_of_view_and_up(browser: Chromium, run: Path) -> None:

@@ -98,7 +98,8 @@ class SelectPanel:
         self._client.scene.add_line_segments(
             ROOM, lines, np.array(COLOR, np.uint8), thickness=2.0, thickness_units="screen"
         )
-        self._note.content = f"{len(self._corners)} corners. Keep or remove the inside."
+        count = len(self._corners)
+        self._note.content = f"{count} corner{'s' if count > 1 else ''}. Keep or remove the inside."
 
     def _end(self) -> None:
         """End to draw, and forget the outline."""

@@ -48,6 +48,7 @@ class SelectPanel:
         distance: float,
     ) -> None:
         self._client, self._request, self._changed, self._distance = client, request, changed, distance
+        self._is_drawing = False
         self._view: Request | None = None
         self._corners: tuple[Place, ...] = ()
         buttons = {
@@ -55,7 +56,7 @@ class SelectPanel:
             "Draw an outline": (self._draw_outline, "Then keep or remove what the picture shows in it."),
             "Keep inside": (self._keep, "At any distance from this camera."),
             "Remove inside": (self._remove, "At any distance from this camera."),
-            "Undo": (self._undo, "Take back the last selection."),
+            "Undo": (self._undo, "Take back what is drawn, or the last selection."),
         }
         for label, (action, hint) in buttons.items():
             client.gui.add_button(label, hint=hint).on_click(action)
@@ -64,12 +65,12 @@ class SelectPanel:
     # -- drawing ----------------------------------------------------------------------------------------------
 
     async def _draw_rectangle(self, _: Any) -> None:
-        self._end()
+        self._begin()
         self._client.scene.on_rect_select()(self._dragged)
         self._note.content = "Drag a rectangle over the picture."
 
     async def _draw_outline(self, _: Any) -> None:
-        self._end()
+        self._begin()
         self._client.scene.on_click()(self._clicked)
         self._note.content = "Click the corners of an outline, and do not move the camera."
 
@@ -101,12 +102,17 @@ class SelectPanel:
         count = len(self._corners)
         self._note.content = f"{count} corner{'s' if count > 1 else ''}. Keep or remove the inside."
 
+    def _begin(self) -> None:
+        """Begin a new outline."""
+        self._end()
+        self._is_drawing = True
+
     def _end(self) -> None:
         """End to draw, and forget the outline."""
         self._client.scene.remove_rect_select_callback(self._dragged)
         self._client.scene.remove_click_callback(self._clicked)
         self._client.scene.remove_by_name(ROOM)
-        self._view, self._corners, self._note.content = None, (), ""
+        self._is_drawing, self._view, self._corners = False, None, ()
 
     # -- selecting --------------------------------------------------------------------------------------------
 
@@ -125,8 +131,8 @@ class SelectPanel:
         self._show()
 
     async def _undo(self, _: Any) -> None:
-        """Forget the outline if there is one, else the last selection."""
-        if not self._corners:
+        """Forget what is drawn, or else the last selection."""
+        if not self._is_drawing:
             self.polygons = self.polygons[:-1]
         self._end()
         self._show()

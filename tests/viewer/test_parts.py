@@ -124,7 +124,7 @@ def test_parts_of_rays_are_what_is_within_polygons(crop: Crop) -> None:
     assert not bool((given[2].fars > given[2].nears).any())
     views = views_within(View(SMALL), crop, 4.0, 4.0, 0.5, 10.0)  # of the ray in the middle
     ends = [view.camera.pixel_rays(torch.tensor([40]), 0.5, 10.0).fars for view in views]
-    torch.testing.assert_close(ends, [part.fars[40:41] for part in parts_within(rays[40:41], crop)])
+    torch.testing.assert_close(ends, [part.fars for part in parts_within(rays[40:41], crop)])
 
 
 class Fog(RendersRays):

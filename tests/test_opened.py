@@ -138,6 +138,11 @@ def test_a_point_cloud_lies_on_the_ball(ball: Path, shared_tiny: Path, tmp_path:
     near = opened.point_cloud(regions=[nerfloom.edit.Sphere((0, 0, 1), 0.5)], **few)
     assert 0 < len(near) < len(found)
     assert float((near.positions - torch.tensor([0, 0, 1.0])).norm(dim=-1).max()) <= 0.5
+    axes = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    view = nerfloom.edit.Polygon((0.0, 0.0, 9.0), axes, ((0, -1), (1, -1), (1, 1), (0, 1)), keep=False)  # all of x > 0
+    left = opened.point_cloud(regions=[view], **few)
+    assert 0 < len(left) < len(found)
+    assert float(left.positions[:, 0].max()) <= 0
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ class RegionFlags:
     crop_sphere: str | None = None
     """Keep the inside of a sphere: X,Y,Z,RADIUS."""
     region: Path | None = None
-    """Keep the inside of the box or sphere of a file, such as 'sphere: {center: [0, 0, 0], radius: 1}'."""
+    """Keep the regions of a file: boxes, spheres and polygons on views, as the viewer saves them."""
 
     def box(self) -> Box | None:
         """Return the box of --crop-box; None if it is not given.
@@ -63,7 +63,7 @@ class RegionFlags:
             FlagError: if one of them is none.
             ConfigError: if the file of one cannot be read.
         """
-        from nerfloom.geometry.regions import read_region
+        from nerfloom.geometry.regions import read_regions
 
-        file = None if self.region is None else read_region(self.region)
-        return [region for region in (self.box(), self.sphere(), file) if region is not None]
+        of_file = [] if self.region is None else read_regions(self.region)
+        return [region for region in (self.box(), self.sphere(), *of_file) if region is not None]

@@ -7,7 +7,7 @@
     edited.write("clean.spz")
 
 Each step takes an `Edited` and returns another one. `ns-edit` takes the same steps, by the same names. Exports keep the
-inside of a `Box` or a `Sphere`.
+inside of a `Box`, a `Sphere`, or a `Polygon` on a view.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from nerfloom.edit.recipe import read_recipe as read_recipe
 from nerfloom.edit.recipe import write_recipe as write_recipe
 from nerfloom.edit.taking import take_steps as take_steps
 from nerfloom.geometry.regions import Box as Box
+from nerfloom.geometry.regions import Polygon as Polygon
 from nerfloom.geometry.regions import Sphere as Sphere
-from nerfloom.geometry.regions import read_region as read_region
-from nerfloom.geometry.regions import write_region as write_region
+from nerfloom.geometry.regions import read_regions as read_regions
+from nerfloom.geometry.regions import write_regions as write_regions

@@ -75,7 +75,7 @@ def _prepared(
     settings.check_ranges()
     if settings.texture_size is not None and path.suffix.lower() == ".ply":
         raise ConfigError("--texture-size: a PLY file has no texture; take --format obj or --format glb")
-    corners = bounds_of_all(regions) if regions else (None, None)
+    corners = bounds_of_all(regions) or (None, None)
     lattice = lattice_of(loaded.model.scene.box, settings.resolution, loaded.placement, *corners)
     return lattice, [region.moved(*loaded.placement.similarity()) for region in regions]
 

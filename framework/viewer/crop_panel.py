@@ -1,4 +1,4 @@
-"""The crop box of one browser: its corners as numbers, its edges over the picture, and an arrow at each face."""
+"""The crop of one browser: a box with its corners as numbers and an arrow at each face, and drawn selections."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerfloom.base.console import say
-from nerfloom.geometry.regions import Box, Vector, write_region
+from nerfloom.geometry.regions import Box, Region, Vector, write_regions
 from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.crop import meaning
-from nerfloom.viewer.request import MAX_COORDINATE, Crop, corner_of, number_in
+from nerfloom.viewer.request import MAX_COORDINATE, Crop, Request, corner_of, number_in
+from nerfloom.viewer.select_panel import SelectPanel
 
 if TYPE_CHECKING:
     import viser
@@ -27,7 +28,7 @@ COLOR = (0, 160, 255)
 ARROW = 70.0
 """Length of an arrow, pixels."""
 FILE = "crop.yaml"
-"""Name of the region's file in the folder of a run or a file."""
+"""Name of the regions' file in the folder of a run or a file."""
 Face = tuple[int, int]
 """Axis of a face's normal, and 0 for the face of the minimum corner or 1 for the maximum corner."""
 FACES: tuple[Face, ...] = tuple(product(range(3), range(2)))
@@ -42,10 +43,17 @@ class CropPanel:
     Args:
         client: the browser.
         loaded: function that returns the model and its run.
+        request: function that returns the browser's request; None if its camera is invalid.
         changed: function that is called when the crop has changed.
     """
 
-    def __init__(self, client: viser.ClientHandle, loaded: Callable[[], Loaded], changed: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        loaded: Callable[[], Loaded],
+        request: Callable[[], Request | None],
+        changed: Callable[[], None],
+    ) -> None:
         self._client, self._loaded, self._changed = client, loaded, changed
         self._edges: Any = None
         self._arrows: dict[Face, Any] = {}
@@ -62,7 +70,8 @@ class CropPanel:
             hint = "Distance from the camera, scene units."
             self._near = gui.add_number("Near", 0.0, min=0.0, step=step, hint=hint)
             self._far = gui.add_number("Far", round(float(model.scene.far), 3), min=0.0, step=step, hint=hint)
-            gui.add_button("Save the box", hint=f"{FILE} in the folder of the run or file.").on_click(
+            self._selected = SelectPanel(client, request, changed, distance=20 * step)
+            gui.add_button("Save the crop", hint=f"{FILE} in the folder of the run or file.").on_click(
                 lambda _: self._save()
             )
             self._note = gui.add_markdown("")
@@ -72,17 +81,17 @@ class CropPanel:
             handle.on_update(self._resized)
 
     def toggle(self) -> None:
-        """Switch the crop on or off."""
+        """Switch the box on or off."""
         self._cropping.value = self._cropping.value is not True
 
     def crop(self) -> Crop | None:
-        """Return the crop; None if it is off, or its box is empty."""
-        box = self._box()
-        if box is None or self._cropping.value is not True:
-            return None
+        """Return the crop; None if there are no selections, and the box is off or empty."""
+        box, polygons = self._box() if self._cropping.value is True else None, self._selected.polygons
+        if box is None:
+            return Crop(polygons=polygons) if polygons else None
         near = number_in(self._near.value, 0, MAX_COORDINATE, 0)
         far = number_in(self._far.value, 0, MAX_COORDINATE, MAX_COORDINATE)
-        return Crop(box, near, far if far > near else math.inf)
+        return Crop(box, near, far if far > near else math.inf, polygons)
 
     def _box(self) -> Box | None:
         """Return the box, in the frame of the scene; None if it is empty."""
@@ -154,19 +163,22 @@ class CropPanel:
 
     # -- its file ---------------------------------------------------------------------------------------------
 
-    def region(self) -> Box | None:
-        """Return the box in the frame and unit of exports; None if the crop is off, or the box is empty."""
+    def regions(self) -> list[Region]:
+        """Return the box and the selections in the frame and unit of exports; none if nothing is cropped."""
         crop = self.crop()
-        return None if crop is None else crop.box.moved(*self._loaded().placement.original_similarity())
+        if crop is None:
+            return []
+        crop = crop.moved(*self._loaded().placement.original_similarity())
+        return [*(() if crop.box is None else (crop.box,)), *crop.polygons]
 
     def _save(self) -> None:
-        """Write the box to the folder of the run or file."""
-        region, file = self.region(), self._loaded().folder / FILE
-        if region is None:
-            self._note.content = "There is no box: the crop is off, or a lowest coordinate is not below the highest."
+        """Write the box and the selections to the folder of the run or file."""
+        regions, file = self.regions(), self._loaded().folder / FILE
+        if not regions:
+            self._note.content = "There is no crop: it is off, or a lowest coordinate is not below the highest."
             return
         try:
-            write_region(file, region)
+            write_regions(file, regions)
         except OSError as error:
             self._note.content = f"Cannot write {FILE}: {error.strerror or error}"
             return

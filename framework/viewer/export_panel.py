@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from nerfloom.export.kinds import KINDS, kinds_of
-from nerfloom.geometry.regions import write_region
+from nerfloom.geometry.regions import write_regions
 from nerfloom.training.loaded import Loaded
 from nerfloom.viewer.command_panel import CommandPanel
 from nerfloom.viewer.commands import Commands
@@ -48,7 +48,7 @@ class ExportPanel:
         self._loaded, self._request, self._crop, self._opens = loaded, request, crop, commands.opens
         self._choices = choices(loaded())
         gui, folder = client.gui, folder_of(loaded()).relative_to(loaded().folder).as_posix()
-        gui.add_markdown(f"Exports the inside of the crop box, at the time shown, into the folder {plain(folder)}.")
+        gui.add_markdown(f"Exports what the crop leaves, at the time shown, into the folder {plain(folder)}.")
         kinds = [name for name, _ in self._choices.values()]
         first = kinds.index(next(name for name in PREFERRED if name in kinds))
         self._kind = gui.add_dropdown("What", list(self._choices), initial_value=list(self._choices)[first])
@@ -59,19 +59,19 @@ class ExportPanel:
     def _export(self) -> None:
         """Start ns-export in another process."""
         name, suffix = self._choices[one_of(self._kind.value, list(self._choices))]
-        region = self._crop.region()
-        if region is not None and not KINDS[name].is_cropped:
-            self._note.content = f"{name} takes no crop: switch the crop off."
+        regions = self._crop.regions()
+        if regions and not KINDS[name].is_cropped:
+            self._note.content = f"{name} takes no crop: switch the box off, and undo selections."
             return
         self._note.content = ""
         folder = folder_of(self._loaded())
         words: list[object] = [name, "--output-dir", folder, *self._flags(name, suffix)]
         try:
-            # Not in the run's folder: another browser may save its box there before the process has read this one.
+            # Not in the run's folder: another browser may save its crop there before the process has read this one.
             with TemporaryDirectory(prefix="nerfloom-") as temporary:
-                if region is not None:
+                if regions:
                     file = Path(temporary) / FILE
-                    write_region(file, region)
+                    write_regions(file, regions)
                     words += ["--region", file]
                 self._command.run("nerfloom.cli.export", [*words, *self._opens], lambda: newest(folder, suffix))
         except OSError as error:

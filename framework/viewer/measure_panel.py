@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nerfloom.base.errors import NerfloomError
 from nerfloom.cameras.view import View
-from nerfloom.viewer.crop import CroppedCameras
+from nerfloom.viewer.crop import views_within
 from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import Request, number_in
@@ -65,7 +65,7 @@ class MeasurePanel:
 
     def _listen(self) -> None:
         """Begin or end to take clicks on the picture as points."""
-        self._client.scene.remove_click_callback()
+        self._client.scene.remove_click_callback(self._clicked)
         if self._picking.value is True:
             self._client.scene.on_click()(self._clicked)
             self._tell("Click the first point.")
@@ -86,12 +86,16 @@ class MeasurePanel:
     def _pick(self, request: Request, column: float, row: float) -> None:
         """Add the point at a pixel of a view, and show the length if there are two."""
         loaded = self._queue.loaded
-        camera = request.camera().to(loaded.model.device)
-        view = View(camera if request.crop is None else CroppedCameras.of(camera, request.crop), request.time)
-        try:
-            point = loaded.placement.points(loaded.pick(view, column, row)[None])[0]
-        except NerfloomError as error:
-            self._tell(f"{plain(str(error))}.")
+        scene, whole = loaded.model.scene, View(request.camera().to(loaded.model.device), request.time)
+        problem = ""
+        for view in views_within(whole, request.crop, column, row, scene.near, scene.far):
+            try:
+                point = loaded.placement.points(loaded.pick(view, column, row)[None])[0]
+                break
+            except NerfloomError as error:
+                problem = str(error)
+        else:
+            self._tell(f"{plain(problem)}.")
             return
         size = SIZE * float((point - request.pose.tensor()[:, 3]).norm())
         self._points = [*(self._points if len(self._points) == 1 else []), (point, size)]

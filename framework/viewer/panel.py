@@ -47,7 +47,7 @@ class Panel:
         with gui.add_folder("Background", expand_by_default=False):
             self._own_background = gui.add_checkbox("Own colour", False)
             self._background = gui.add_rgb("Colour", (255, 255, 255))
-        self.crop = None if scene.warped else CropPanel(client, lambda: queue.loaded, self._ask)
+        self.crop = None if scene.warped else CropPanel(client, lambda: queue.loaded, self.request, self._ask)
         if shown_cells(queue.loaded.model, 1) is not None:
             self._cells = gui.add_checkbox("Occupied cells", False, hint="Outer cells of the sampled region")
             self._cells.on_update(lambda _: self._show_cells())

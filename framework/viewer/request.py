@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.ndc import Ndc, NdcCameras
-from nerfloom.geometry.regions import Box
+from nerfloom.geometry.regions import Box, Polygon
 
 MAX_COORDINATE = 1e6
 """Maximum coordinate of a camera, scene units."""
@@ -42,12 +42,27 @@ class Pose:
 class Crop:
     """Visible part of space."""
 
-    box: Box
-    """The box, in the frame of the scene."""
+    box: Box | None = None
+    """The box, in the frame of the scene; None for all of space."""
     near: float = 0.0
     """Nothing nearer to the camera is shown, scene units."""
     far: float = math.inf
     """Nothing farther from the camera is shown, scene units."""
+    polygons: tuple[Polygon, ...] = ()
+    """Polygons on views of pinholes, in the frame of the scene. What is in all of them is shown."""
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Return whether `points` (N, 3) are in the box and in all polygons, (N,) bool."""
+        inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
+        for region in (*self.polygons, *(() if self.box is None else (self.box,))):
+            inside &= region.contains(points)
+        return inside
+
+    def moved(self, rotation: Tensor, scale: float, shift: Tensor) -> Crop:
+        """Return the crop after a similarity transform, as in `Request.moved`."""
+        box = None if self.box is None else self.box.moved(rotation, scale, shift)
+        polygons = tuple(polygon.moved(rotation, scale, shift) for polygon in self.polygons)
+        return Crop(box, scale * self.near, scale * self.far, polygons)
 
 
 @dataclass(frozen=True)
@@ -86,9 +101,7 @@ class Request:
         pose = self.pose.tensor()
         place = scale * (rotation @ pose[:, 3]) + shift
         matrix = torch.cat([rotation @ pose[:, :3], place[:, None]], dim=1)
-        crop = self.crop
-        if crop is not None:
-            crop = Crop(crop.box.moved(rotation, scale, shift), scale * crop.near, scale * crop.far)
+        crop = None if self.crop is None else self.crop.moved(rotation, scale, shift)
         return replace(self, pose=Pose(tuple(matrix.flatten().tolist()), self.pose.fov), crop=crop)
 
     def camera(self, stride: int = 1, rows: tuple[int, int] | None = None, ndc: Ndc | None = None) -> Cameras:

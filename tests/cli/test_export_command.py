@@ -15,6 +15,7 @@ from nerfloom.cameras.refinement import PoseRefinement
 from nerfloom.cli.export import main
 from nerfloom.data.ply import read_points, write_points
 from nerfloom.export.cameras import camera_list
+from nerfloom.geometry.regions import AXES, Polygon, write_regions
 from tests.conftest import Refused
 from tests.training.helpers import tiny_trainer
 
@@ -92,6 +93,15 @@ def test_meshes_are_of_the_ball(ball: Path, tmp_path: Path, monkeypatch: pytest.
     cap = trimesh.load(tmp_path / "mesh.ply", process=False, force="mesh")
     assert len(cap.faces) > 30
     assert np.linalg.norm(cap.vertices - top, axis=1).max() < 0.7 + 1e-3
+    # A square in the picture of a camera at (0, 0, 5) that looks down; a polygon has no end, so the box is the scene's.
+    square = Polygon((0.0, 0.0, 5.0), AXES, ((-0.1, -0.1), (0.1, -0.1), (0.1, 0.1), (-0.1, 0.1)))
+    for keep in (True, False):
+        write_regions(tmp_path / "square.yaml", [replace(square, keep=keep)])
+        export(monkeypatch, "marching-cubes", *given, "--resolution", 24, "--region", tmp_path / "square.yaml")
+        x, y, z = trimesh.load(tmp_path / "mesh.ply", process=False, force="mesh").vertices.T
+        assert len(x) > 30
+        inside = np.maximum(np.abs(x), np.abs(y)) / (5 - z)
+        assert (inside.max() < 0.1 + 1e-4) if keep else (inside.min() > 0.1 - 1e-4)
     box = ("--crop-box", "50,50,50,51,51,51")
     assert "no training view sees a surface in the box" in refused(main, "tsdf", *coarse, *box)
     assert "no occupied cell in the box" in refused(main, "marching-cubes", *coarse, *box)

@@ -52,7 +52,7 @@ from nerfloom.evaluation.surfaces import drawn
 from nerfloom.export.mesh import Mesh
 from nerfloom.export.mesh_files import write_mesh
 from nerfloom.geometry.rays import Rays
-from nerfloom.geometry.regions import Box, read_region, write_region
+from nerfloom.geometry.regions import Box, Polygon, Sphere, read_regions, write_regions
 from nerfloom.levels.files import read_levels
 from nerfloom.octrees.drawn import DrawnOctree
 from nerfloom.octrees.files import read_octree, write_octree
@@ -574,7 +574,7 @@ def read_run_scale(folder: Path, scratch: Path) -> None:
 
 
 def write_edits(folder: Path) -> None:
-    """A recipe of ns-edit with settings of every type, and a region."""
+    """A recipe of ns-edit with settings of every type, and regions of every kind."""
     steps = [
         step_of("crop_box", {"low": [-1, -1, 0], "high": [1, 1.5, 2], "keep": False}, "here"),
         step_of("crop_polygon", {"image": "a.png", "corners": [[0, 0], [3, 0], [0, 3]]}, "here"),
@@ -584,14 +584,17 @@ def write_edits(folder: Path) -> None:
     ]
     write_steps(folder / "edit.yml", steps)
     (folder / "region.yml").write_text("sphere: {center: [0, 0, 1], radius: 2.5}\n", encoding="utf-8")
-    write_region(folder / "box.yml", Box((-1, -1, 0), (1, 1.5, 2), ((0.6, 0.8, 0), (-0.8, 0.6, 0), (0, 0, 1))))
+    axes = (0.6, 0.8, 0), (-0.8, 0.6, 0), (0, 0, 1)
+    view = Polygon((0, 0, 2), axes, ((0, 0), (0.5, 0), (0, 0.5)), False, "fisheye", (0.1, 0.01, 0, 0))
+    write_regions(folder / "all.yml", [Box((-1, -1, 0), (1, 1.5, 2), axes), view, Sphere((0, 0, 0), 3)])
 
 
 def read_edits(folder: Path, scratch: Path) -> None:
     for step in read_steps(folder / "edit.yml"):
         require(step.name in STEPS, "a step that does not exist")
-    for name in ("region.yml", "box.yml"):
-        require(read_region(folder / name).contains(torch.zeros(1, 3)).shape == (1,), "another shape")
+    for name in ("region.yml", "all.yml"):
+        for region in read_regions(folder / name):
+            require(region.contains(torch.zeros(1, 3)).shape == (1,), "another shape")
 
 
 READERS: dict[str, Reader] = {

@@ -61,7 +61,7 @@ MUTANTS = {
             "viewer/test_beside.py::test_what_is_the_same_looks_the_same_in_both_scenes"),
     ],
     "nerfloom.viewer.request": [
-        Mutant("crop-stays-behind", "Request.moved", "crop.box.moved(A, B, C)", "crop.box",
+        Mutant("crop-stays-behind", "Request.moved", "self.crop.moved(A, B, C)", "self.crop",
             "the second run is cropped in another place than the first",
             "viewer/test_beside.py::test_what_is_the_same_looks_the_same_in_both_scenes"),
     ],

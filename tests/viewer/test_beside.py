@@ -12,7 +12,7 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
 from nerfloom.data.scene import Scene
-from nerfloom.geometry.regions import Box
+from nerfloom.geometry.regions import Box, Polygon
 from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.training.loaded import Loaded
@@ -59,8 +59,18 @@ def there() -> Loaded:
     return loaded(means, 0.8, SCALE, Placement(torch.cat([ROTATION, SHIFT[:, None] / SCALE], 1), SCALE))
 
 
+FROM_X = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
+"""The axes of a camera that looks along -x."""
+
+
 @pytest.mark.parametrize(
-    "crop", [None, Crop(Box((-2.0, -2.0, -1.0), (0.5, 2.0, 3.0)), near=0.5, far=4.3), Crop(Box((0,) * 3, (2,) * 3))]
+    "crop",
+    [
+        None,
+        Crop(Box((-2.0, -2.0, -1.0), (0.5, 2.0, 3.0)), near=0.5, far=4.3),
+        Crop(Box((0,) * 3, (2,) * 3)),
+        Crop(polygons=(Polygon((4.0, 0.0, 0.0), FROM_X, ((-0.1, -0.2), (0.3, -0.2), (0.3, 0.3)), keep=False),)),
+    ],
 )
 @pytest.mark.parametrize("output", ["rgb", "depth"])
 def test_what_is_the_same_looks_the_same_in_both_scenes(

@@ -13,7 +13,7 @@ import pytest
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.export.kinds import KINDS, export
-from nerfloom.geometry.regions import Box, Region, read_region
+from nerfloom.geometry.regions import Box, Region, read_regions
 from nerfloom.training.load import load
 from nerfloom.viewer import commands, trained_viewer
 from nerfloom.viewer.command_panel import CommandPanel
@@ -166,7 +166,7 @@ def test_an_export_has_a_crop_file_of_its_own(tmp_path: Path) -> None:
         assert words[-2:] == opens
         flags = dict(zip(words[1:-2:2], words[2:-2:2], strict=True))
         files.append(flags["--region"])
-        read.append(read_region(files[-1]))
+        read.extend(read_regions(files[-1]))
 
     opens = ["--load-config=run", "--data=elsewhere"]
     loaded = SimpleNamespace(model=SimpleNamespace(), folder=tmp_path, is_run=True, source=object())
@@ -175,7 +175,7 @@ def test_an_export_has_a_crop_file_of_its_own(tmp_path: Path) -> None:
         screen,
         lambda: loaded,
         lambda: None,
-        SimpleNamespace(region=lambda: left.pop(0)),
+        SimpleNamespace(regions=lambda: [left.pop(0)]),
         SimpleNamespace(start=start, opens=opens),
     ]
     panel = ExportPanel(*given)

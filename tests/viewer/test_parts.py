@@ -19,14 +19,17 @@ from nerfloom.base import extras
 from nerfloom.base.config import TrainConfig
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.machine_config import ViewerConfig
+from nerfloom.cameras.outline import outlined
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
 from nerfloom.cli import train as train_command
 from nerfloom.cli import viewer as viewer_command
 from nerfloom.data.scene import Scene
-from nerfloom.geometry.regions import Box
+from nerfloom.geometry.rays import Rays
+from nerfloom.geometry.regions import AXES, Box, Polygon
 from nerfloom.methods.gaussian_splatting import GaussianSplatting, GaussianSplattingConfig, decide
-from nerfloom.renderable import Renderable
+from nerfloom.renderable import Renderable, RendersRays
+from nerfloom.rendering.rendered import Picture, Rendered
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.training.checkpoint import list_checkpoints
@@ -35,7 +38,7 @@ from nerfloom.training.run import Run
 from nerfloom.training.trained import load_trained
 from nerfloom.viewer.browser import Browser
 from nerfloom.viewer.camera_panel import CameraPanel
-from nerfloom.viewer.crop import CroppedCameras, picture_within
+from nerfloom.viewer.crop import CroppedCameras, parts_within, picture_within, views_within
 from nerfloom.viewer.crop_panel import FACES, dragged, edges, middle, outward
 from nerfloom.viewer.markdown import plain
 from nerfloom.viewer.occupancy import shown_cells
@@ -69,6 +72,89 @@ def test_cropped_rays() -> None:
         torch.tensor([40]), 0.5, 10.0
     )
     assert (float(between.nears), float(between.fars)) == pytest.approx((3.5, 4.5))
+
+
+SMALL = Request(Pose(ABOVE, 1.2), 9, 9).camera()
+"""Its picture of 9 x 9 pixels."""
+SIDE = Polygon(
+    (6.0, 0.1, 0.2),
+    ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)),
+    ((-0.15, -0.15), (0.15, -0.15), (0.15, -0.05), (0.0, -0.05), (0.0, 0.2), (-0.15, 0.2)),
+    keep=False,
+)
+"""All but an L in the picture of a camera on the x axis."""
+CROPS = {
+    "removed": Crop(polygons=(SIDE,)),
+    "kept": Crop(polygons=(dataclasses.replace(SIDE, keep=True),)),
+    "its-own-view": Crop(polygons=(outlined(SMALL, ((0.7, 1.2), (6.3, 2.4), (3.1, 7.6))),)),
+    "all": Crop(Box((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0)), 2.5, 5.5, (
+        SIDE, dataclasses.replace(SIDE, position=(6.0, 0.9, 0.4)),
+        Polygon((0.0, 0.0, 9.0), AXES, ((-0.25, -0.2), (0.2, -0.15), (0.05, 0.25))),
+    )),
+}  # fmt: skip
+
+
+def steps_within(rays: Rays, crop: Crop) -> torch.Tensor:
+    """Which of 2000 positions along each ray are in a crop (R, 2000); the step is a hundredth of 0.475."""
+    t = 0.5 + (torch.arange(2000) + 0.5) * (9.5 / 2000)
+    points = rays.origins[:, None] + t[:, None] * rays.directions[:, None]
+    inside = crop.contains(points.view(-1, 3)).view(len(rays), -1)
+    return inside & (t >= crop.near) & (t <= crop.far)
+
+
+@pytest.mark.parametrize("crop", CROPS.values(), ids=CROPS)
+def test_parts_of_rays_are_what_is_within_polygons(crop: Crop) -> None:
+    rays = SMALL.pixel_rays(torch.arange(81), 0.5, 10.0)
+    parts, inside = parts_within(rays, crop), steps_within(rays, crop)
+    t = 0.5 + (torch.arange(2000) + 0.5) * (9.5 / 2000)
+    found = torch.zeros_like(inside)
+    for before, part in itertools.pairwise([None, *parts]):
+        assert part is not None
+        assert bool((part.fars >= part.nears).all())
+        if before is not None:  # a missing part is at the end of the ray
+            assert bool((part.nears >= before.fars).all())
+        found |= (t > part.nears[:, None]) & (t < part.fars[:, None])
+    edges = inside[:, 1:] != inside[:, :-1]
+    assert int((found != inside).sum()) <= int(edges.sum())  # a step at each edge
+    assert 0.005 < inside.float().mean() < 0.95
+    at_once = [CroppedCameras.of(SMALL, crop, part) for part in (0, 1, 9)]
+    given = [camera.pixel_rays(torch.arange(81), 0.5, 10.0) for camera in at_once]
+    torch.testing.assert_close(given[0].nears, parts[0].nears)
+    assert bool((given[1].fars > given[1].nears).any()) == (len(parts) > 1)
+    assert not bool((given[2].fars > given[2].nears).any())
+    views = views_within(View(SMALL), crop, 4.0, 4.0, 0.5, 10.0)  # of the ray in the middle
+    ends = [view.camera.pixel_rays(torch.tensor([40]), 0.5, 10.0).fars for view in views]
+    torch.testing.assert_close(ends, [part.fars for part in parts_within(rays[40:41], crop)])
+
+
+class Fog(RendersRays):
+    """Grey matter of the same density everywhere."""
+
+    device, rays_at_once = torch.device("cpu"), 2**16  # type: ignore[assignment]
+    scene = Scene(torch.tensor([[-3.0] * 3, [3.0] * 3]), 0.5, 10.0, 4, True, False, 32, image_pixels=32 * 32)
+
+    def render(self, rays: Rays, background: torch.Tensor) -> Rendered:
+        share = 1 - (-0.4 * (rays.fars - rays.nears)).exp()
+        rgb = 0.3 * share[:, None] + (1 - share[:, None]) * background
+        return Rendered(rgb, rays.nears, rays.nears, share, len(rays))
+
+    def render_view(self, view: View, background: torch.Tensor) -> Picture:
+        rays = view.camera.pixel_rays(view.camera.image_pixels(0), self.scene.near, self.scene.far)
+        found, size = self.render(rays, background), (view.height, view.width)
+        depths = (values.view(size) for values in (found.depth, found.median_depth, found.accumulation))
+        return Picture(found.rgb.view(*size, 3), *depths)
+
+
+@pytest.mark.parametrize("crop", CROPS.values(), ids=CROPS)
+def test_fog_within_polygons_is_as_dense_as_the_length_of_its_parts(crop: Crop) -> None:
+    """The parts of a ray are composited: transmittances multiply, so lengths add up."""
+    camera, background = SMALL, torch.tensor([1.0, 0.5, 0.0])
+    found = picture_within(Fog(), View(camera), crop, background)
+    length = steps_within(camera.pixel_rays(torch.arange(81), 0.5, 10.0), crop).sum(-1) * (9.5 / 2000)
+    share = (1 - (-0.4 * length).exp()).view(9, 9)
+    torch.testing.assert_close(found.accumulation, share, atol=5e-3, rtol=0)
+    expected = 0.3 * share[..., None] + (1 - share[..., None]) * background
+    torch.testing.assert_close(found.rgb, expected, atol=5e-3, rtol=0)
 
 
 def test_the_edges_and_the_arrows_of_the_box() -> None:
@@ -117,6 +203,11 @@ def test_gaussians_outside_of_a_crop_are_not_drawn() -> None:
     assert middle(Crop(Box((-3.0, -3.0, 1.0), corner), near=2.5)) == [1, 1, 1]  # the wall is 2 away
     assert middle(Crop(Box((-3.0, -3.0, -3.0), corner), near=2.5)) == [0, 1, 0]
     assert middle(Crop(Box((-3.0, -3.0, -3.0), corner), far=1.5)) == [1, 1, 1]
+    wall = Polygon((9.0, 0.0, 2.0), SIDE.axes, ((-0.5, -0.1), (0.5, -0.1), (0.5, 0.1), (-0.5, 0.1)))
+    assert middle(Crop(polygons=(wall,))) == [1, 0, 0]
+    assert middle(Crop(polygons=(dataclasses.replace(wall, keep=False),))) == [0, 1, 0]
+    both = dataclasses.replace(wall, position=(0.0, 0.0, 9.0), axes=AXES, keep=False)  # from above
+    assert middle(Crop(polygons=(wall, both))) == [1, 1, 1]
 
 
 class Slow(Speed):

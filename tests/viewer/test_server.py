@@ -12,10 +12,11 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.view import View
-from nerfloom.geometry.regions import Box, read_region
+from nerfloom.geometry.regions import Box, read_regions
 from nerfloom.training.datasets import load_split
 from nerfloom.training.run import create_folder
 from nerfloom.training.trainer import Trainer
@@ -190,13 +191,73 @@ def test_an_arrow_moves_a_face_of_the_box_and_the_file_is_the_region(
     cut = client.finished()
     assert np.abs(cut.astype(int) - typed.finished()).max() < 8
     assert decibels(cut, whole) < 25
-    client.set("Save the box", True)
+    client.set("Save the crop", True)
     file = served.folder / "crop.yaml"
     until(file.is_file)
-    found, placement = read_region(file), served.queue.loaded.placement
+    (found,), placement = read_regions(file), served.queue.loaded.placement
     assert isinstance(found, Box)
     ends = placement.points(torch.tensor([found.low, found.high]))  # the tiny data set is placed without a rotation
     np.testing.assert_allclose(ends, [low, [*high[:2], 0.25]], atol=1e-6)
+
+
+def select(client: Client, kind: str, *places: tuple[float, float]) -> None:
+    """Draw a rectangle, or click one corner of an outline."""
+    message = {"type": "ScenePointerMessage", "event_type": kind, "screen_pos": places, "modifier": None}
+    ray = (0.0, 0.0, 0.0) if kind == "click" else None
+    client.send({**message, "ray_origin": ray, "ray_direction": ray})
+
+
+@pytest.mark.medium
+def test_selections_are_kept_removed_undone_and_saved(served: Served, connected: Callable[..., Client]) -> None:
+    """A rectangle in the picture of its own camera, an outline from another one, and the regions of their file."""
+    client = connected()
+    client.look()
+    whole = client.finished().astype(int)
+    inside = np.zeros((60, 80), bool)
+    inside[15:45, 20:48] = True
+    edge = binary_dilation(inside, iterations=9) & ~binary_erosion(inside, iterations=9)  # JPEG's blocks
+    assert (np.abs(whole - 255).max(-1) > 40)[inside].mean() > 0.5
+    client.set("Keep inside", True)  # there is none
+    client.set("Draw a rectangle", True)
+    select(client, "rect-select", (0.3, 0.3), (0.3, 0.3))
+    select(client, "rect-select", (float("nan"), 0.25), (0.25, 0.1))
+    select(client, "rect-select", (0.25, 0.25), (0.6, 0.75))
+    client.set("Remove inside", True)
+    removed = client.finished().astype(int)
+    assert (removed[inside & ~edge] > 245).all()
+    assert np.abs(removed - whole)[~inside & ~edge].max() < 12
+    client.set("Undo", True)
+    assert np.abs(client.finished() - whole).max() < 12
+    select(client, "rect-select", (0.1, 0.1), (0.9, 0.9))  # nothing takes it
+    client.set("Draw a rectangle", True)
+    select(client, "rect-select", (0.25, 0.25), (0.6, 0.75))
+    client.set("Keep inside", True)
+    kept = client.finished().astype(int)
+    assert (kept[~inside & ~edge] > 245).all()
+    assert np.abs(kept - whole)[inside & ~edge].max() < 12
+    client.look(**FROM_THE_SIDE)
+    from_the_side = client.finished()
+    client.set("Draw an outline", True)
+    for place in ((0.1, 0.1), (0.9, 0.1), (0.5, 0.6)):
+        select(client, "click", place)
+    client.set("Remove inside", True)
+    assert decibels(client.finished(), from_the_side) < 30
+    client.set("Save the crop", True)
+    file = served.folder / "crop.yaml"
+    until(file.is_file)
+    first, second = read_regions(file)
+    file.unlink()
+    scene = 6 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 3
+    points = served.queue.loaded.placement.original_points(scene)
+    x, y, z = scene.numpy().T  # both cameras have a focal length of 30 / tan(0.35) pixels; see `LOOK`
+    column, row = (40 + 30 / np.tan(0.35) * x / (z + 4)) / 80, (30 + 30 / np.tan(0.35) * y / (z + 4)) / 60
+    truth = (z > -4) & (np.abs(column - 0.425) < 0.175) & (np.abs(row - 0.5) < 0.25)
+    np.testing.assert_array_equal(first.contains(points), truth)
+    column, row = (40 + 30 / np.tan(0.35) * x / (y + 4)) / 80, (30 - 30 / np.tan(0.35) * z / (y + 4)) / 60
+    across, down = np.abs(column - 0.5) / 0.4, (row - 0.1) / 0.5
+    np.testing.assert_array_equal(second.contains(points), ~((y > -4) & (down > 0) & (across + down < 1)))
+    client.set("Undo", True)
+    assert np.abs(client.finished().astype(int) - from_the_side).max() < 12
 
 
 @pytest.mark.medium

@@ -6,8 +6,9 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, binary_erosion
 
-from nerfloom.geometry.regions import Box, read_region
+from nerfloom.geometry.regions import Box, read_regions
 from nerfloom.runs import load
 from nerfloom.splats.files import read_gaussians
 from nerfloom.training.trained import load_trained
@@ -79,13 +80,13 @@ def test_the_box_is_drawn_and_an_arrow_is_dragged(browser: Chromium, run: Path) 
         start, rise = root + 0.6 * (tip - root), 0.7 * ARROW / scale
         tab.drag(tuple(start), tuple(start + 0.7 * (tip - root)))
         tab.pause()
-        tab.press("Save the box")
+        tab.press("Save the crop")
         file = run / "crop.yaml"
         until(file.is_file)
         tick(tab, "Show the box")
         until(lambda: edge_pixels(tab) < drawn / 2)  # the ball has such colours too
         tab.close()
-    found = read_region(file)
+    (found,) = read_regions(file)
     file.unlink()
     print(f"pixels of edges: {without} without, {drawn} drawn")
     assert isinstance(found, Box)
@@ -94,6 +95,67 @@ def test_the_box_is_drawn_and_an_arrow_is_dragged(browser: Chromium, run: Path) 
     np.testing.assert_allclose(ends[1][:2], high[:2], atol=1e-5)
     print(f"the face rose by {ends[1][2] - 0.3:.3f} of {rise:.3f}")
     assert ends[1][2] - 0.3 == pytest.approx(rise, rel=0.2)
+
+
+def test_a_rectangle_and_an_outline_select(browser: Chromium, run: Path) -> None:
+    """What the picture shows in them is gone, or all the rest is; in the file, too."""
+    look, placement = look_of(run), load_trained(run, device_type="cpu").placement
+    rows, columns = np.mgrid[PICTURE]
+    in_rectangle = (columns > 180) & (columns < 320) & (rows > 300) & (rows < 440)
+    in_outline = (rows > 240) & (np.abs(columns - 300) < 180 * (500 - rows) / 260)
+    lines = binary_dilation(in_outline, iterations=4) & ~binary_erosion(in_outline, iterations=4)
+    with started(command("ns-viewer"), run, "--websocket-port", 18507) as (_, address):
+        tab = browser.open(address)
+        whole = shown(tab)
+        matter = np.abs(whole - 255).max(-1) > 40  # the background is white
+
+        def shown_without(gone: np.ndarray) -> None:
+            """The picture becomes the first one without what is gone, apart from JPEG's blocks at its edge."""
+            assert matter[gone].mean() > 0.1
+            assert matter[~gone].mean() > 0.1
+            clear = ~binary_dilation(gone, iterations=9) | binary_erosion(gone, iterations=9)
+            truth = np.where(gone[..., None], 255, whole)
+            until(lambda: decibels(shown(tab)[clear], truth[clear]) > 35)
+
+        tab.press("Crop")
+        tab.pause()
+        tab.press("Draw a rectangle")
+        tab.pause()
+        tab.drag((180, 300), (320, 440))
+        until(lambda: "4 corners" in text_of(tab))
+        tab.press("Remove inside")
+        shown_without(in_rectangle)
+        tab.press("Undo")
+        shown_like(tab, whole, 50)
+        tab.press("Draw an outline")
+        for count, place in enumerate(((120, 240), (480, 240), (300, 500)), 1):
+            tab.pause()
+            tab.click(*place)
+            until(lambda count=count: f"{count} corner" in text_of(tab))
+        drawn = shown_unlike(tab, whole, 60)
+        tab.press("Keep inside")
+        shown_without(~in_outline)
+        until(lambda: "1 selection" in text_of(tab))
+        kept = shown(tab)
+        tab.press("Save the crop")
+        file = run / "crop.yaml"
+        until(file.is_file)
+        points = 2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1
+        places = np.array([pixel_of(tab, look, point)[0] for point in points.tolist()])
+        tab.drag((300, 300), (420, 280))  # the mouse moves the camera again
+        shown_unlike(tab, kept, 40)
+        tab.close()
+    (region,) = read_regions(file)
+    file.unlink()
+    changed = np.abs(drawn - whole).max(-1) > 40
+    print(f"pixels of the outline: {changed.sum()}")
+    assert changed.sum() > 300
+    assert not (changed & ~lines).any()
+    sides = np.abs(places[:, 0] - 300) - 180 * (500 - places[:, 1]) / 260
+    found, truth = region.contains(placement.original_points(points)).numpy(), (sides < 0) & (places[:, 1] > 240)
+    clear = (np.abs(sides) > 2) & (np.abs(places[:, 1] - 240) > 2)  # clicks are at whole pixels
+    assert 30 < truth.sum() < 270
+    np.testing.assert_array_equal(found[clear], truth[clear])
 
 
 def test_field_of_view_and_up(browser: Chromium, run: Path) -> None:
@@ -168,7 +230,7 @@ def test_what_is_shown_is_exported_and_downloaded(browser: Chromium, shared_tiny
         tick(tab, "Crop")
         type_into(tab, "Highest corner", 2, "0")
         tab.pause()
-        tab.press("Save the box")
+        tab.press("Save the crop")
         until((tmp_path / "crop.yaml").is_file)
         tab.press("Export")
         tab.pause()
@@ -183,7 +245,7 @@ def test_what_is_shown_is_exported_and_downloaded(browser: Chromium, shared_tiny
         tab.close()
     means = read_gaussians(file).gaussians.means.double()
     assert 0 < len(means) < len(read_gaussians(shown_file).gaussians)
-    region = read_region(tmp_path / "crop.yaml")
+    (region,) = read_regions(tmp_path / "crop.yaml")
     assert region.contains(means).all()
 
 

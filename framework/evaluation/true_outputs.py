@@ -37,7 +37,7 @@ def normal_mae(picture: Picture, dataset: Dataset, index: int, half: bool) -> fl
 def diffuse_psnr(picture: Picture, dataset: Dataset, index: int, half: bool) -> float | None:
     """Return the PSNR of the rendered diffuse light of a view in display colours, dB; None as in `normal_mae`.
 
-    Nothing is aligned: an error of scale counts. The arguments are those of `normal_mae`.
+    Nothing is aligned: an error of scale counts. `picture`, `dataset`, `index` and `half` are as in `normal_mae`.
     """
     light = dataset.diffuse_of(index)
     truth = None if light is None else to_srgb(light).clamp(max=1)

@@ -147,7 +147,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Polygon:
-    """What a view shows in a polygon, at any distance from its camera, or all the rest.
+    """Part of space that a view shows in a polygon, at any distance from its camera, or all the rest.
 
     Raises:
         ConfigError: if it has fewer than three corners, its camera's axes are not unit vectors at right angles, or its
@@ -226,7 +226,7 @@ class Polygon:
         return EVERYWHERE
 
     def grown(self, by: float) -> Polygon:
-        """Return the polygon itself: vertices of a mesh lie on its sides by chance alone, whatever their rounding."""
+        """Return the polygon itself, whatever `by` is: vertices of a mesh lie on its sides by chance alone."""
         return self
 
     def moved(self, rotation: Tensor, scale: float, shift: Tensor) -> Polygon:
@@ -311,7 +311,7 @@ def inside_polygon(x: Tensor, y: Tensor, corners: Sequence[Place]) -> Tensor:
 
 
 def axes_of(rows: Tensor) -> Axes:
-    """Return the rows of a matrix (3, 3) as axes."""
+    """Return the `rows` (3, 3) of a matrix as axes."""
     first, second, third = map(_vector, rows)
     return first, second, third
 
@@ -354,7 +354,7 @@ def inside_all(points: Tensor, regions: Sequence[Region]) -> Tensor:
 
 
 def bounds_of_all(regions: Sequence[Region]) -> tuple[Vector, Vector] | None:
-    """Return the minimum and the maximum corner of a box around the intersection of some regions; None if unbounded.
+    """Return the minimum and the maximum corner of a box around the intersection of `regions`; None if unbounded.
 
     Raises:
         ConfigError: if nothing is in all of them.

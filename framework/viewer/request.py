@@ -59,7 +59,7 @@ class Crop:
         return inside
 
     def moved(self, rotation: Tensor, scale: float, shift: Tensor) -> Crop:
-        """Return the crop after a similarity transform, as in `Request.moved`."""
+        """Return the crop after a similarity transform; `rotation`, `scale` and `shift` are as in `Request.moved`."""
         box = None if self.box is None else self.box.moved(rotation, scale, shift)
         polygons = tuple(polygon.moved(rotation, scale, shift) for polygon in self.polygons)
         return Crop(box, scale * self.near, scale * self.far, polygons)

@@ -151,7 +151,7 @@ def place_of(position: Any) -> Place:
 
 
 def is_same(first: Request, second: Request) -> bool:
-    """Return whether two requests are for pictures of the same size from the same camera."""
+    """Return whether the requests `first` and `second` are for pictures of the same size from the same camera."""
     moved = (first.pose.tensor() - second.pose.tensor()).abs().max()
     size = first.width, first.height, first.pose.fov
     return size == (second.width, second.height, second.pose.fov) and bool(moved <= STILL)

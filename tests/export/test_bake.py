@@ -189,7 +189,7 @@ def test_a_capture_is_baked_without_holes(tmp_path: Path) -> None:
     loaded = SimpleNamespace(
         model=model,
         method="painted",
-        run=SimpleNamespace(config=SimpleNamespace(machine=SimpleNamespace(seed=0))),
+        run=SimpleNamespace(config=replace(method.config, robust="off")),
         dataset=lambda split: dataset,
         input_placement=Placement.of(torch.eye(3, 4), 1.0),
     )

@@ -15,7 +15,7 @@ RowsT = TypeVar("RowsT", bound="TensorRows")
 
 @dataclass(frozen=True)
 class TensorRecord:
-    """A frozen dataclass in which some fields are tensors."""
+    """A frozen dataclass with tensors among its fields."""
 
     def map(self: RecordT, change: Callable[[Tensor], Tensor]) -> RecordT:
         """Return the record with a function applied to every tensor.
@@ -34,7 +34,7 @@ class TensorRecord:
 
 @dataclass(frozen=True)
 class TensorRows(TensorRecord):
-    """A record in which every tensor has one row for each of the same items."""
+    """A record of items: every tensor has one row for each."""
 
     def __getitem__(self: RowsT, index: Tensor | slice) -> RowsT:
         """Return the items selected by a slice, a mask or an index tensor."""

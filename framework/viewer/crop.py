@@ -153,7 +153,7 @@ def _over(front: Picture, back: Picture, background: Tensor) -> Picture:
     """Return a picture of two parts of each ray, both over the background (3,).
 
     Colour, opacity and expected depth are those of the whole rays. The median depth and further outputs of a pixel are
-    those of the part with which its opacity reaches one half.
+    those of the part that brings its opacity to one half.
     """
     clear = 1 - front.accumulation
     accumulation = front.accumulation + clear * back.accumulation

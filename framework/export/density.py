@@ -72,7 +72,7 @@ class LatticeDensity:
     """
 
     quantity = "density"
-    """Name of what is evaluated, for messages."""
+    """Name of the evaluated quantity, for messages."""
     _skipped = 0.0
     """The value in skipped cells."""
 

@@ -7,13 +7,16 @@ see. A batch of its views has no image: light, exposure and poses that images ha
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from nerfloom.base.config import TrainConfig
+from nerfloom.base.console import track
 from nerfloom.base.device import stream_seed
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras, subpixels
@@ -31,15 +34,19 @@ from nerfloom.training.teacher import Teacher, load_teacher
 VIEWS = 4
 """Number of views that the pixels of a batch come from."""
 PICTURES = 48
-"""Number of whole pictures that a teacher renders, each when it is first drawn."""
+"""Number of pictures that a teacher renders, each when it is first drawn."""
+MIN_PICTURES, MAX_PICTURES = 6, 480
+"""Minimum and maximum number of pictures that are rendered ahead."""
 MAX_SIDE = 800
-"""Maximum longer side of a whole picture in pixels; views of larger images are reduced."""
+"""Maximum longer side of an image in pixels; views of larger images are reduced."""
 OPAQUE = 0.95
 """Minimum opacity of a pixel for its distance to count."""
 GOLDEN = (5**0.5 - 1) / 2
 """Fractional part of the golden ratio; its multiples are spread most evenly."""
 PICTURE_STREAM = -3
-"""Random stream of a whole picture, beside the streams of steps (`nerfloom.base.device`)."""
+"""Random stream of a picture, beside the streams of steps (`nerfloom.base.device`)."""
+Render = Callable[[View, Tensor], Picture]
+"""Function from a view and the colour (3,) of a background to a picture, as `Renderable.render_view`."""
 
 
 def is_taught(step: int, share: float) -> bool:
@@ -60,6 +67,22 @@ def unseen_cameras(cameras: Cameras, near: Tensor) -> Cameras:
     """Return random cameras between and around the cameras `near` (V,), with lenses and sizes of `cameras`."""
     poses = unseen_poses(cameras.camera_to_worlds.cpu(), near)
     return replace(cameras[near], camera_to_worlds=poses.to(cameras.camera_to_worlds))
+
+
+def random_part(camera: Cameras, side: int) -> tuple[Cameras, tuple[slice, slice]]:
+    """Return the camera of a random part of an image, of the image's shape, and the part's rows and columns.
+
+    Args:
+        camera: one camera.
+        side: maximum longer side of the part, pixels.
+    """
+    sizes = camera.sizes[0]
+    share = min(side / max(sizes), 1.0)
+    height, width = (max(round(share * size), 1) for size in sizes)
+    top, left = (int(torch.randint(size - shown + 1, ())) for size, shown in zip(sizes, (height, width), strict=True))
+    widths, heights = torch.full_like(camera.widths, width), torch.full_like(camera.heights, height)
+    part = replace(camera, cx=camera.cx - left, cy=camera.cy - top, widths=widths, heights=heights)
+    return part, (slice(top, top + height), slice(left, left + width))
 
 
 def known_depths(picture: Picture) -> Tensor:
@@ -110,59 +133,63 @@ class TaughtPixels(BatchSource):
         return numbers[chosen], tuple(each[chosen] for each in values)
 
 
-@dataclass(frozen=True)
-class Shot:
-    """A picture of a teacher, before a black background."""
-
-    view: View
-    """Its camera, in the pupil's scene."""
-    rgb: Tensor
-    """(H, W, 3) float16 light."""
-    opacity: Tensor
-    """(H, W) float16."""
-    distances: Tensor
-    """(H, W) distances along the rays, 0 where unknown."""
-
-
 class TaughtViews(BatchSource):
-    """Draws whole pictures of a teacher, from a fixed number of views.
+    """Draws pictures of a teacher, from a fixed number of views.
 
     A field on a CPU takes longer for a picture than Gaussians for a step, so each view is rendered once.
 
     Args:
-        teacher: the teacher.
+        render: function that renders the teacher's pictures of views in the scene of `dataset`.
         dataset: the training images; their cameras bound the visible space.
         background: background of transparent pixels, one colour for the whole picture.
         seed: seed of the run.
+        side: maximum longer side of a picture, pixels; of larger images, it shows a random part.
     """
 
-    def __init__(self, teacher: Teacher, dataset: Dataset, background: Background, seed: int) -> None:
-        self.teacher, self.dataset, self.background, self.seed = teacher, dataset, background, seed
+    def __init__(
+        self, render: Render, dataset: Dataset, background: Background, seed: int, side: int = MAX_SIDE
+    ) -> None:
+        self.render, self.dataset, self.background, self.seed, self.side = render, dataset, background, seed, side
         sizes = torch.maximum(dataset.cameras.widths, dataset.cameras.heights)
         factor = min(1.0, MAX_SIDE / int(sizes.max()))
         self.cameras = dataset.cameras if factor == 1 else dataset.cameras.scaled(factor)
-        self._shots: dict[int, Shot] = {}
+        self.count = PICTURES
+        """Number of pictures to draw from."""
+        self._pictures: dict[int, tuple[View, Tensor, Tensor, Tensor]] = {}
+
+    def render_ahead(self, seconds: float) -> None:
+        """Render pictures for about `seconds`, at least MIN_PICTURES, and draw from these alone."""
+        start, self.count = time.perf_counter(), 0
+        for percent in track(range(1, 101), "Rendering pictures", total=100):
+            end = start + seconds * percent / 100
+            while self.count < MIN_PICTURES or (self.count < MAX_PICTURES and time.perf_counter() < end):
+                self._picture(self.count)
+                self.count += 1
 
     def draw(self, request: Request) -> ViewBatch:
-        number = int(torch.randint(PICTURES, ()))
+        number = int(torch.randint(self.count, ()))
         behind = background_colors(self.background, 1, self.dataset.device)[0]
-        if number not in self._shots:
-            self._shots[number] = self._shot(number)
-        shot = self._shots[number]
-        opacity = shot.opacity.float()
-        rgb = shot.rgb.float() + (1 - opacity[..., None]) * behind
-        alpha = opacity if self.dataset.scene.has_alpha else None
-        return ViewBatch(None, shot.view, rgb, behind, alpha, distances=shot.distances)
+        view, light, opacity, distances = self._picture(number)
+        rgb = light.float() + (1 - opacity.float()[..., None]) * behind
+        alpha = opacity.float() if self.dataset.scene.has_alpha else None
+        return ViewBatch(None, view, rgb, behind, alpha, distances=distances)
 
-    def _shot(self, number: int) -> Shot:
-        """Render a picture; its view depends on the seed and its `number` only."""
-        times = self.dataset.times
-        with torch.random.fork_rng(devices=[]):  # whether a picture is new must not change what is drawn after it
-            torch.default_generator.manual_seed(stream_seed(self.seed, number, PICTURE_STREAM))
-            near = torch.randint(len(self.cameras), (1,))
-            view = View.of(unseen_cameras(self.cameras, near), 0, None if times is None else times[near])
-            picture = self.teacher.picture(view, torch.zeros(3, device=self.dataset.device))
-        return Shot(view, picture.rgb.half(), picture.accumulation.half(), known_depths(picture))
+    def _picture(self, number: int) -> tuple[View, Tensor, Tensor, Tensor]:
+        """Return a view, its light (H, W, 3) and opacity (H, W), float16, and distances (H, W), 0 where unknown.
+
+        It is rendered at the first call, and depends only on the seed and its `number`.
+        """
+        if number not in self._pictures:
+            times = self.dataset.times
+            with torch.random.fork_rng(devices=[]):  # whether it is new must not change what is drawn after it
+                torch.default_generator.manual_seed(stream_seed(self.seed, number, PICTURE_STREAM))
+                near = torch.randint(len(self.cameras), (1,))
+                camera, _ = random_part(unseen_cameras(self.cameras, near), self.side)
+                view = View.of(camera, 0, None if times is None else times[near])
+                shown = self.render(view, torch.zeros(3, device=self.dataset.device))
+            light, opacity = shown.rgb.clamp(0, 1).half(), shown.accumulation.clamp(0, 1).half()
+            self._pictures[number] = view, light, opacity, known_depths(shown)
+        return self._pictures[number]
 
 
 class MixedSource(BatchSource):
@@ -172,7 +199,7 @@ class MixedSource(BatchSource):
         photographs: source of the photographs.
         taught: source of the teacher's views.
         share: share of the teacher at the start; it falls linearly.
-        until: fraction of the budget, more than 0, until the share is 0.
+        until: fraction of the budget, more than 0, until the share is 0; infinity for a share that does not fall.
     """
 
     varies = "a teacher renders some of the batches"
@@ -229,5 +256,5 @@ def batch_source(model: Model[Any], dataset: Dataset, config: TrainConfig) -> Ba
     background = training_background(config.background, dataset.scene)
     taught: BatchSource = TaughtPixels(teacher, dataset, background)
     if model.batches == "views":
-        taught = TaughtViews(teacher, dataset, background, config.machine.seed)
+        taught = TaughtViews(teacher.picture, dataset, background, config.machine.seed)
     return MixedSource(photographs, taught, config.teacher_share, config.teacher_until)

@@ -260,11 +260,6 @@ MUTANTS = {
             "points have the normals of others",
             "truth/test_export.py::test_points_are_where_half_of_the_light_is_gone_and_within_reach_of_the_box"),
     ],
-    "nerfloom.export.splat_fit": [
-        Mutant("part-of-an-image-shifted", "cropped", "A - top", "A + top",
-            "Gaussians are fitted to parts of pictures that are in other places",
-            "web/test_page.py::test_a_part_of_an_image_sees_what_the_image_sees_there"),
-    ],
     "nerfloom.export.tsdf": [
         Mutant("fused-depth-unweighted-side", "FusedDistance.values", "A & (behind < self.truncation)", "A",
             "what is hidden in a view counts as far behind its surface, so that the back of things is lost",

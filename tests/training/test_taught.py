@@ -31,7 +31,7 @@ from nerfloom.training import load as loading
 from nerfloom.training import taught as taught_file
 from nerfloom.training.checkpoint import load_checkpoint
 from nerfloom.training.run import read_run
-from nerfloom.training.taught import MixedSource, TaughtPixels, TaughtViews, is_taught
+from nerfloom.training.taught import MixedSource, TaughtPixels, TaughtViews, is_taught, random_part
 from nerfloom.training.teacher import Teacher
 from nerfloom.training.trainer import Trainer
 from tests.blocks.fakes import Drifted, cameras, placement
@@ -41,6 +41,7 @@ from tests.octrees.balls import CELL, RADIUS, ball
 from tests.octrees.test_drawn import front
 from tests.training.helpers import TINY, assert_same_bits, tensors, tiny_run, tiny_trainer
 from tests.training.taught import SHARP, THICK, marble, placed
+from tests.web.helpers import some_cameras
 
 BLACK = torch.zeros(3)
 
@@ -100,6 +101,9 @@ def test_photographs_finish() -> None:
     assert drawn(0.25).count("taught") == pytest.approx(32, abs=2)
     assert drawn(0.375).count("taught") == pytest.approx(16, abs=2)
     assert drawn(0.5).count("taught") == drawn(1.0).count("taught") == 0
+    mixed.until = math.inf
+    assert drawn(1.0).count("taught") == 64
+    mixed.until = 0.5
     for step in range(8):
         mixed.learn(Request(step, 0, progress=0.25), None, BLACK)
     assert sorted(photographs.learnt + taught.learnt) == list(range(8))
@@ -231,7 +235,7 @@ def test_photographs_without_alpha_have_none_of_the_teacher_either() -> None:
 def test_whole_pictures_without_alpha_have_the_background_that_was_asked_for() -> None:
     dataset = ball_under_a_sky()
     teacher = octree_teacher(dataset)[2]
-    batch = drawn(TaughtViews(teacher, dataset, "white", seed=5), 0)
+    batch = drawn(TaughtViews(teacher.picture, dataset, "white", seed=5), 0)
     assert batch.alpha is None
     expected = teacher.picture(batch.view, torch.ones(3))
     assert float(expected.accumulation.min()) < 0.5
@@ -263,7 +267,7 @@ def test_whole_pictures_are_rendered_once(monkeypatch: pytest.MonkeyPatch) -> No
     dataset = ball_in_a_box()
     model, own, _ = octree_teacher(dataset)
     teacher = Counted(model, own, dataset.placement)
-    one, other = (TaughtViews(teacher, dataset, "random", seed=5) for _ in range(2))
+    one, other = (TaughtViews(teacher.picture, dataset, "random", seed=5) for _ in range(2))
     batches = [drawn(one, 0, seed=seed) for seed in range(30)]
     assert teacher.count == 3
     assert len({batch.view.camera.camera_to_worlds.flatten().tolist()[3] for batch in batches}) == 3
@@ -282,9 +286,39 @@ def test_whole_pictures_are_rendered_once(monkeypatch: pytest.MonkeyPatch) -> No
 def test_large_pictures_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(taught_file, "MAX_SIDE", 12)
     dataset = ball_in_a_box()
-    batch = drawn(TaughtViews(octree_teacher(dataset)[2], dataset, "white", 0), 0)
+    batch = drawn(TaughtViews(octree_teacher(dataset)[2].picture, dataset, "white", 0), 0)
     assert batch.rgb.shape == (12, 12, 3)
     assert batch.view.camera.sizes == [[12, 12]]
+
+
+def test_a_part_of_an_image_sees_what_the_image_sees_there() -> None:
+    torch.manual_seed(1)
+    camera = some_cameras()[:1]
+    part, (rows, columns) = random_part(camera, 100)
+    assert part.sizes == [[75, 100]]
+    assert (rows.stop - rows.start, columns.stop - columns.start) == (75, 100)
+    assert 0 <= rows.start <= 75
+    assert 0 <= columns.start <= 100
+    points = torch.randn(20, 3) * 0.2
+    whole, some = camera.project(points, 0), part.project(points, 0)
+    torch.testing.assert_close(some[0], whole[0] - columns.start)
+    torch.testing.assert_close(some[1], whole[1] - rows.start)
+    assert random_part(camera, 200)[0].sizes == camera.sizes == [[150, 200]]
+
+
+def test_pictures_that_are_rendered_ahead_are_all_that_is_drawn() -> None:
+    """The fewest if there is no time. Their views and their parts of images differ."""
+    dataset = ball_in_a_box()
+    model, own, _ = octree_teacher(dataset)
+    teacher = Counted(model, own, dataset.placement)
+    source = TaughtViews(teacher.picture, dataset, "white", seed=5, side=10)
+    source.render_ahead(0.0)
+    assert teacher.count == source.count == taught_file.MIN_PICTURES
+    cameras = [drawn(source, 0, seed=seed).view.camera for seed in range(60)]
+    assert teacher.count == taught_file.MIN_PICTURES
+    assert len({tuple(camera.camera_to_worlds.flatten().tolist()) for camera in cameras}) > 1
+    assert len({(float(camera.cx), float(camera.cy)) for camera in cameras}) > 1
+    assert cameras[0].sizes == [[10, 10]]
 
 
 # -- trainings ------------------------------------------------------------------------------------------------------

@@ -15,10 +15,12 @@ import pytest
 import torch
 
 from nerfloom.base.errors import ConfigError, DataError
-from nerfloom.cameras.cameras import Cameras
 from nerfloom.cli.export import main
+from nerfloom.data.pixels.pixel_set import PixelSet
+from nerfloom.data.sources import Request, ViewSource
+from nerfloom.export import splat_fit
 from nerfloom.export.run_page import start_of
-from nerfloom.export.splat_fit import between, cropped
+from nerfloom.export.splat_fit import PartsOfPhotographs
 from nerfloom.export.web import (
     DATA,
     MAX_CAMERAS,
@@ -38,6 +40,7 @@ from nerfloom.export.web import (
 from nerfloom.kernels.splats.project import rotation_matrices
 from nerfloom.splats.look import Look
 from nerfloom.splats.spz import read_spz
+from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.trained import load_trained
 from tests.conftest import EditJson, Refused
 from tests.training.helpers import tiny_trainer
@@ -278,30 +281,25 @@ def about_z(angle: float) -> torch.Tensor:
     return torch.tensor([[c, -s, 0, c], [s, c, 0, s], [0, 0, 1, 0.5]])
 
 
-def test_half_way_between_two_cameras() -> None:
-    cameras = replace(some_cameras(3), camera_to_worlds=torch.stack([about_z(a) for a in (0.0, 0.6, 3.0)]))
-    found = between(cameras, 0)
-    assert found is not None
-    expected = about_z(0.3)
-    torch.testing.assert_close(found.camera_to_worlds[0, :, :3], expected[:, :3])
-    torch.testing.assert_close(found.camera_to_worlds[0, :, 3], (about_z(0.0) + about_z(0.6))[:, 3] / 2)
-    back = about_z(0.0) @ torch.diag(torch.tensor([1.0, -1, -1, 1]))  # looks the other way
-    assert between(replace(cameras[:2], camera_to_worlds=torch.stack([about_z(0.0), back])), 0) is None
-    assert between(cameras[:1], 0) is None
-
-
-def test_a_part_of_an_image_sees_what_the_image_sees_there() -> None:
-    torch.manual_seed(1)
-    camera: Cameras = some_cameras()[:1]
-    part = cropped(camera, 0.5)
-    assert (int(part.widths), int(part.heights)) == (100, 75)
-    left, top = float(camera.cx - part.cx), float(camera.cy - part.cy)
-    assert 0 <= left <= 100
-    assert 0 <= top <= 75
-    points = torch.randn(20, 3) * 0.2
-    whole, some = camera.project(points, 0), part.project(points, 0)
-    torch.testing.assert_close(some[0], whole[0] - left)
-    torch.testing.assert_close(some[1], whole[1] - top)
+def test_parts_of_photographs_show_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of a large photograph, also where a mask leaves pixels out."""
+    monkeypatch.setattr(splat_fit, "MAX_SIDE", 9)
+    dataset = ball_in_a_box()
+    kept = torch.rand(len(dataset.pixels), generator=torch.Generator().manual_seed(1)) < 0.7
+    dataset = replace(dataset, kept=PixelSet.of_mask(kept))
+    parts, photographs = PartsOfPhotographs(dataset, "white", seed=3), ViewSource(dataset, "white", seed=3)
+    corners = set()
+    for step in range(6):
+        part, whole = (source.draw(Request(step, 0)) for source in (parts, photographs))
+        given, found = whole.view.camera, part.view.camera
+        left, top = round(float(given.cx - found.cx)), round(float(given.cy - found.cy))
+        corners.add((left, top))
+        here = slice(top, top + 9), slice(left, left + 9)
+        assert part.rgb.shape == (9, 9, 3)
+        assert torch.equal(found.camera_to_worlds, given.camera_to_worlds)
+        assert torch.equal(part.rgb, whole.rgb[here])
+        assert torch.equal(part.weights, whole.weights[here])
+    assert len(corners) > 1
 
 
 # -- the command --------------------------------------------------------------------------------------------------

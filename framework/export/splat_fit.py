@@ -37,8 +37,6 @@ from nerfloom.training.trainer import Trainer
 
 PICTURES_SHARE = 0.45
 """Share of the budget for rendering pictures; the rest is for training steps."""
-PART_SIDE = 400
-"""Maximum longer side of a picture in pixels: parts of images, because small images have too little detail."""
 FIELD_SHARE = 0.5
 """Share of the field's steps beside those of photographs. It does not fall: Gaussians have to look like the field."""
 MAX_GAUSSIANS, MAX_RATE = 300_000, 5.0
@@ -105,7 +103,7 @@ def fit_gaussians(
     dataset = replace(dataset, scene=replace(dataset.scene, num_scenes=1), depths=None, sparse_depth=None)
     drawable = replace(dataset, cameras=cameras)
     background = training_background("auto", dataset.scene)
-    pictures = TaughtViews(model.render_view, drawable, background, machine.seed, PART_SIDE)
+    pictures = TaughtViews(model.render_view, drawable, background, machine.seed)
     pictures.render_ahead(PICTURES_SHARE * seconds)
     exact = dataset.times is None and dataset.cameras.model in DRAWN and not dataset.scene.appearance_varies
     train_set, share, used = (dataset, FIELD_SHARE, len(dataset)) if exact else (drawable, 1.0, 0)

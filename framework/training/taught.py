@@ -35,7 +35,7 @@ VIEWS = 4
 """Number of views that the pixels of a batch come from."""
 PICTURES = 48
 """Number of pictures that a teacher renders, each when it is first drawn."""
-MIN_PICTURES, MAX_PICTURES = 6, 480
+MIN_PICTURES, MAX_PICTURES = 6, 4 * PICTURES
 """Minimum and maximum number of pictures that are rendered ahead."""
 MAX_SIDE = 800
 """Maximum longer side of an image in pixels; views of larger images are reduced."""
@@ -143,28 +143,36 @@ class TaughtViews(BatchSource):
         dataset: the training images; their cameras bound the visible space.
         background: background of transparent pixels, one colour for the whole picture.
         seed: seed of the run.
-        side: maximum longer side of a picture, pixels; of larger images, it shows a random part.
     """
 
-    def __init__(
-        self, render: Render, dataset: Dataset, background: Background, seed: int, side: int = MAX_SIDE
-    ) -> None:
-        self.render, self.dataset, self.background, self.seed, self.side = render, dataset, background, seed, side
+    def __init__(self, render: Render, dataset: Dataset, background: Background, seed: int) -> None:
+        self.render, self.dataset, self.background, self.seed = render, dataset, background, seed
         sizes = torch.maximum(dataset.cameras.widths, dataset.cameras.heights)
         factor = min(1.0, MAX_SIDE / int(sizes.max()))
         self.cameras = dataset.cameras if factor == 1 else dataset.cameras.scaled(factor)
-        self.count = PICTURES
-        """Number of pictures to draw from."""
+        self.count, self.side = PICTURES, MAX_SIDE
+        """Number of pictures to draw from, and maximum longer side of a new one; it may show a part of an image."""
+        generator = torch.Generator().manual_seed(stream_seed(seed, -1, PICTURE_STREAM))
+        self.order = torch.randperm(len(dataset), generator=generator)
+        """Cameras that views are near: each once before any twice, so that few views are everywhere."""
         self._pictures: dict[int, tuple[View, Tensor, Tensor, Tensor]] = {}
 
     def render_ahead(self, seconds: float) -> None:
-        """Render pictures for about `seconds`, at least MIN_PICTURES, and draw from these alone."""
-        start, self.count = time.perf_counter(), 0
+        """Render pictures for about `seconds`, and draw from these alone.
+
+        They are random parts of images, since small images have too little detail. MIN_PICTURES have half of an image's
+        width and height; by the time that they take, the others are as large as lets about PICTURES fit.
+        """
+        start, whole = time.perf_counter(), max(map(max, self.cameras.sizes))
+        self.count, self.side = 0, round(whole / 2)
         for percent in track(range(1, 101), "Rendering pictures", total=100):
             end = start + seconds * percent / 100
             while self.count < MIN_PICTURES or (self.count < MAX_PICTURES and time.perf_counter() < end):
                 self._picture(self.count)
                 self.count += 1
+                if self.count == MIN_PICTURES:
+                    room = seconds / PICTURES / ((time.perf_counter() - start) / MIN_PICTURES)
+                    self.side = round(whole * min(max(math.sqrt(room) / 2, 0.5), 1.0))
 
     def draw(self, request: Request) -> ViewBatch:
         number = int(torch.randint(self.count, ()))
@@ -177,13 +185,13 @@ class TaughtViews(BatchSource):
     def _picture(self, number: int) -> tuple[View, Tensor, Tensor, Tensor]:
         """Return a view, its light (H, W, 3) and opacity (H, W), float16, and distances (H, W), 0 where unknown.
 
-        It is rendered at the first call, and depends only on the seed and its `number`.
+        It is rendered at the first call, and depends only on the seed, its `number` and `side`.
         """
         if number not in self._pictures:
             times = self.dataset.times
             with torch.random.fork_rng(devices=[]):  # whether it is new must not change what is drawn after it
                 torch.default_generator.manual_seed(stream_seed(self.seed, number, PICTURE_STREAM))
-                near = torch.randint(len(self.cameras), (1,))
+                near = self.order[[number % len(self.order)]]
                 camera, _ = random_part(unseen_cameras(self.cameras, near), self.side)
                 view = View.of(camera, 0, None if times is None else times[near])
                 shown = self.render(view, torch.zeros(3, device=self.dataset.device))
@@ -223,12 +231,6 @@ class MixedSource(BatchSource):
         return MixedSource(
             self.photographs.drawing_from(dataset), self.taught.drawing_from(dataset), self.share, self.until
         )
-
-    def state(self) -> Tensor | None:
-        return self.photographs.state()
-
-    def restore(self, state: Tensor | None) -> None:
-        self.photographs.restore(state)
 
 
 def batch_source(model: Model[Any], dataset: Dataset, config: TrainConfig) -> BatchSource:

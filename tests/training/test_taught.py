@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -72,7 +73,7 @@ def test_any_share_is_kept_from_the_first_step_on(share: float) -> None:
 class Named(BatchSource):
     """Draws its own name, and records its arguments."""
 
-    contradicted = None
+    contradicted: Any = SimpleNamespace(state=torch.tensor([7.0]))
 
     def __init__(self, name: str) -> None:
         self.name, self.learnt, self.dataset = name, list[int](), ball_in_a_box(4)
@@ -85,9 +86,6 @@ class Named(BatchSource):
 
     def learn(self, request: Request, batch: Any, rgb: Tensor) -> None:
         self.learnt.append(request.step)
-
-    def state(self) -> Tensor:
-        return torch.tensor([7.0])
 
 
 def test_photographs_finish() -> None:
@@ -306,19 +304,25 @@ def test_a_part_of_an_image_sees_what_the_image_sees_there() -> None:
     assert random_part(camera, 200)[0].sizes == camera.sizes == [[150, 200]]
 
 
-def test_pictures_that_are_rendered_ahead_are_all_that_is_drawn() -> None:
-    """The fewest if there is no time. Their views and their parts of images differ."""
-    dataset = ball_in_a_box()
+def test_pictures_that_are_rendered_ahead_are_all_that_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fewest and smallest if there is no time. Their views and their parts of images differ."""
+    monkeypatch.setattr(taught_file, "MAX_PICTURES", 9)
+    dataset = ball_in_a_box(24)
     model, own, _ = octree_teacher(dataset)
     teacher = Counted(model, own, dataset.placement)
-    source = TaughtViews(teacher.picture, dataset, "white", seed=5, side=10)
+    source = TaughtViews(teacher.picture, dataset, "white", seed=5)
     source.render_ahead(0.0)
     assert teacher.count == source.count == taught_file.MIN_PICTURES
     cameras = [drawn(source, 0, seed=seed).view.camera for seed in range(60)]
     assert teacher.count == taught_file.MIN_PICTURES
     assert len({tuple(camera.camera_to_worlds.flatten().tolist()) for camera in cameras}) > 1
     assert len({(float(camera.cx), float(camera.cy)) for camera in cameras}) > 1
-    assert cameras[0].sizes == [[10, 10]]
+    assert all(camera.sizes == [[12, 12]] for camera in cameras)
+    source = TaughtViews(teacher.picture, dataset, "white", seed=5)
+    source.render_ahead(math.inf)
+    sides = [drawn(source, 0, seed=seed).rgb.shape[0] for seed in range(60)]
+    assert source.count == 9
+    assert set(sides) == {12, 24}
 
 
 # -- trainings ------------------------------------------------------------------------------------------------------

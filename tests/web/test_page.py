@@ -298,6 +298,8 @@ def test_parts_of_photographs_show_their_pixels(monkeypatch: pytest.MonkeyPatch)
         assert part.rgb.shape == (9, 9, 3)
         assert torch.equal(found.camera_to_worlds, given.camera_to_worlds)
         assert torch.equal(part.rgb, whole.rgb[here])
+        assert part.weights is not None
+        assert whole.weights is not None
         assert torch.equal(part.weights, whole.weights[here])
     assert len(corners) > 1
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing.density import Composited
-from nerfloom.kernels.triton_launch import depth_slope, launch, opacity_of, optical_depth
+from nerfloom.kernels.triton_launch import depth_slope, launch, opacity_of, optical_depth, store_three
 
 BLOCK = 32
 """Samples of a ray processed together, by one warp."""
@@ -107,9 +107,7 @@ def _backward(
         slope = depth_slope(density, delta)
         gradient = tl.where(slope == 0, 0.0, slope * (own * in_front * tl.exp(-tau) - later))
         tl.store(of_sigma + n, gradient, mask=here)
-        tl.store(of_rgb + n * 3, weight * red, mask=here)
-        tl.store(of_rgb + n * 3 + 1, weight * green, mask=here)
-        tl.store(of_rgb + n * 3 + 2, weight * blue, mask=here)
+        store_three(of_rgb + n * 3, weight * red, weight * green, weight * blue, here)
 
 
 class _Composite(torch.autograd.Function):

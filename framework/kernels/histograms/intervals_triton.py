@@ -169,6 +169,17 @@ def resample(
 
 
 @triton.jit
+def _touched(sums, edges, count, intervals, i, here, steps):
+    """Return the weight of the bins that each interval touches, from the sums of the weights of `count` bins."""
+    start = tl.load(intervals + i, mask=here, other=0.0)
+    end = tl.load(intervals + i + 1, mask=here, other=0.0)
+    left = _preceding(edges + 1, start, count, steps, False)
+    right = tl.maximum(_preceding(edges, end, count, steps, True), left)
+    weight = tl.load(sums + right - 1, mask=right > 0, other=0.0)
+    return weight - tl.load(sums + left - 1, mask=left > 0, other=0.0)
+
+
+@triton.jit
 def _excess(
     edges, weights, proposed, proposed_weights, sums, scaled_sums, loss, of_weights, bins, proposed_bins, steps, eps,
     BLOCK: tl.constexpr,
@@ -186,14 +197,8 @@ def _excess(
     for first in range(0, bins, BLOCK):
         i = first + tl.arange(0, BLOCK)
         here = i < bins
-        start = tl.load(edges + i, mask=here, other=0.0)
-        end = tl.load(edges + i + 1, mask=here, other=0.0)
-        left = _preceding(proposed + 1, start, proposed_bins, steps, False)
-        right = tl.maximum(_preceding(proposed, end, proposed_bins, steps, True), left)
-        bound = tl.load(sums + right - 1, mask=right > 0, other=0.0)
-        bound -= tl.load(sums + left - 1, mask=left > 0, other=0.0)
         weight = tl.load(weights + i, mask=here, other=0.0).to(tl.float64)
-        excess = weight - bound
+        excess = weight - _touched(sums, proposed, proposed_bins, edges, i, here, steps)
         excess = tl.where(here & (excess > 0), excess, 0.0)
         scaled = excess / (weight + eps)
         spread += tl.sum(excess * scaled, 0)
@@ -204,12 +209,7 @@ def _excess(
     for first in range(0, proposed_bins, BLOCK):
         j = first + tl.arange(0, BLOCK)
         here = j < proposed_bins
-        start = tl.load(proposed + j, mask=here, other=0.0)
-        end = tl.load(proposed + j + 1, mask=here, other=0.0)
-        left = _preceding(edges + 1, start, bins, steps, False)
-        right = tl.maximum(_preceding(edges, end, bins, steps, True), left)
-        change = tl.load(scaled_sums + right - 1, mask=right > 0, other=0.0)
-        change -= tl.load(scaled_sums + left - 1, mask=left > 0, other=0.0)
+        change = _touched(scaled_sums, edges, bins, proposed, j, here, steps)
         tl.store(of_weights + j, (-2 * change).to(tl.float32), mask=here)
 
 

@@ -18,7 +18,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.kernels.images.ssim import C1, C2, SIGMA, WINDOW, least_in_windows, weighted_error
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, own_rows
 
 BLOCK = 256
 """Elements per program."""
@@ -35,8 +35,7 @@ def _line(device: torch.device) -> Tensor:
 @triton.jit
 def _rows(image, target, line, maps, count, row, shorter, channels, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
     """Blur u, v, u^2 and v^2 along rows of `row` values, which leaves `shorter` values of each."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = own_rows(count, BLOCK)
     at = i // shorter * row + i % shorter
     mean_u = tl.zeros([BLOCK], tl.float32)
     mean_v, square_u, square_v = mean_u, mean_u, mean_u
@@ -61,8 +60,7 @@ def _windows(
 ):  # fmt: skip
     """Blur maps of `size` elements along columns; sum 1 - S, and write the three derivatives of S if requested. Both
     are multiplied by the weights of windows, if there are any."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = own_rows(count, BLOCK)
     mean_u = tl.zeros([BLOCK], tl.float32)
     mean_v, square_u, square_v = mean_u, mean_u, mean_u
     for k in range(WINDOW):
@@ -94,8 +92,7 @@ def _windows(
 @triton.jit
 def _columns_back(slopes, line, maps, size, count, row, windows, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
     """Sum three maps of `size` elements, in `windows` rows, over the windows that cover each row of the image."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = own_rows(count, BLOCK)
     y = i // row
     one = tl.zeros([BLOCK], tl.float32)
     two, three = one, one
@@ -117,8 +114,7 @@ def _rows_back(
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sum the maps over the windows that cover each value of the image, and write the derivative."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = own_rows(count, BLOCK)
     y, x = i // row, i % row
     one = tl.zeros([BLOCK], tl.float32)
     two, three = one, one

@@ -26,7 +26,7 @@ from nerfloom.kernels.octree.light import OctreeLight, contiguous, outputs_of
 from nerfloom.kernels.octree.packed import PackedLeaves
 from nerfloom.kernels.octree.walk import smallest_cells
 from nerfloom.kernels.octree.walk_triton import FRAME, _advance, _begin, _change, _look, _outside, _place
-from nerfloom.kernels.triton_launch import blocks, launch, opacity_of
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, opacity_of, own_rows
 
 RAYS = 32
 """Rays per program."""
@@ -36,9 +36,7 @@ CODES = tl.constexpr(packed.CODES)
 @triton.jit
 def _basis(directions, r, here, BASIS: tl.constexpr, N: tl.constexpr, BLOCK: tl.constexpr):
     """Return the harmonics (BLOCK, N) of rays' directions, once for each channel."""
-    x = tl.load(directions + r * 3, mask=here, other=0.0)
-    y = tl.load(directions + r * 3 + 1, mask=here, other=0.0)
-    z = tl.load(directions + r * 3 + 2, mask=here, other=0.0)
+    x, y, z = load_three(directions + r * 3, here)
     k, out = tl.arange(0, N) % BASIS, tl.full([BLOCK, N], 0.28209479177387814, tl.float32)
     for number in tl.static_range(1, BASIS):
         out = tl.where((k == number)[None, :], harmonics(x, y, z, number)[:, None], out)
@@ -105,8 +103,8 @@ def _walk(
     levels, limit, rays, BASIS: tl.constexpr, N: tl.constexpr, LIMITED: tl.constexpr, MANY: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here, columns = r < rays, tl.arange(0, N)
+    r, here = own_rows(rays, BLOCK)
+    columns = tl.arange(0, N)
     if of_color is not None:  # the backward pass
         opaque, behind, mixed = _known(directions, color, opacity, of_color, of_opacity, r, here, BASIS, N, BLOCK)
     level, far, t = _begin(origins, directions, nears, fars, smallest, frames, numbers, r, here, levels, LIMITED, BLOCK)

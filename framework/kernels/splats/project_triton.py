@@ -50,11 +50,10 @@ from nerfloom.kernels.splats.shapes_triton import (
     quaternion,
     rotation_back,
     shape_back,
-    three,
     to_camera,
     towards,
 )
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, own_rows
 
 BLOCK = 128
 """Gaussians that are taken together."""
@@ -106,12 +105,11 @@ def _forward(
     means, log_scales, rotations, logits, colors, coefficients, pose, records, dropped, count, stride, fx, fy, cx, cy,
     width, height, near, blur, ANTIALIASED: tl.constexpr, BASIS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
-    x, y, z = three(means, n, here)
+    n, here = own_rows(count, BLOCK)
+    x, y, z = load_three(means + n * 3, here)
     p0, p1, p2 = to_camera(pose, x, y, z)
     w, i, j, k, norm, sound = quaternion(rotations, n, here)
-    l0, l1, l2 = three(log_scales, n, here)
+    l0, l1, l2 = load_three(log_scales + n * 3, here)
     s0, s1, s2 = tl.exp(l0), tl.exp(l1), tl.exp(l2)
     logit = tl.load(logits + n, mask=here, other=0.0)
     valid = here & sound & (p2 > near)
@@ -193,14 +191,13 @@ def _backward(
     of_logits, of_colors, of_coefficients, of_pose, count, stride, fx, fy, cx, cy, width, height, blur,
     ANTIALIASED: tl.constexpr, BASIS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     record, grad = records + n * RECORD, gradient + n * RECORD
     shown = here & (tl.load(record + CUT, mask=here, other=0.0) > 0)
-    x, y, z = three(means, n, shown)
+    x, y, z = load_three(means + n * 3, shown)
     p0, p1, p2 = to_camera(pose, x, y, z)
     w, i, j, k, norm, _ = quaternion(rotations, n, shown)
-    s0, s1, s2 = three(log_scales, n, shown)
+    s0, s1, s2 = load_three(log_scales + n * 3, shown)
     s0, s1, s2 = tl.exp(s0), tl.exp(s1), tl.exp(s2)
     over, at_x, at_y, bounded_x, bounded_y = plane(p0, p1, tl.where(shown, p2, 1.0), fx, fy, cx, cy, width, height)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = axes(w, i, j, k)

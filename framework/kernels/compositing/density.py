@@ -139,10 +139,7 @@ class Composited(NamedTuple):
 
 
 def composite_reference(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """Compute `composite` in PyTorch, on any device and for any float type.
-
-    `samples`, `sigma`, `rgb`, `background` and `fars` are as in `composite`.
-    """
+    """Compute `composite` of `samples`, `sigma`, `rgb`, `background` and `fars` in PyTorch, for any float type."""
     weights, transmittance = weights_and_transmittance(sigma, samples)
     opacity = ray_sum(weights, samples)
     left = (1 - opacity).clamp(min=0)

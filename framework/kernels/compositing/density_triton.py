@@ -145,10 +145,7 @@ class _Composite(torch.autograd.Function):
 
 
 def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """Compute `nerfloom.kernels.compositing.density.composite`, with gradients of density and colour.
-
-    `samples`, `sigma`, `rgb`, `background` and `fars` are as there.
-    """
+    """Compute `density.composite` of `samples`, `sigma`, `rgb`, `background` and `fars`, with its gradients."""
     points = None if samples.points is None else samples.points.contiguous()
     inputs = (tensor.contiguous() for tensor in (sigma, rgb, samples.t_starts, samples.t_ends))
     offsets, background, fars = samples.offsets.contiguous(), background.contiguous(), fars.contiguous()
@@ -215,9 +212,6 @@ class _Distortion(torch.autograd.Function):
 
 
 def distortion(weights: Tensor, samples: Samples) -> Tensor:
-    """Compute `nerfloom.kernels.compositing.density.distortion`, with the weights' gradient.
-
-    `weights` and `samples` are as there.
-    """
+    """Compute `density.distortion` of `weights` and `samples`, with the gradient of the weights."""
     inputs = (tensor.contiguous() for tensor in (weights, samples.t_starts, samples.t_ends, samples.offsets))
     return _Distortion.apply(*inputs)

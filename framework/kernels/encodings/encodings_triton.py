@@ -32,10 +32,7 @@ def _harmonics(directions, out, count, WIDTH: tl.constexpr, BLOCK: tl.constexpr)
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
-    """Compute `nerfloom.kernels.encodings.spherical_harmonics.spherical_harmonics`, without derivatives.
-
-    `directions` and `levels` are as there.
-    """
+    """Compute `spherical_harmonics.spherical_harmonics` of `directions` and `levels`, without derivatives."""
     directions, count = directions.contiguous(), len(directions)
     out = directions.new_empty(count, levels**2)
     launch(_harmonics, (blocks(count, BLOCK),), directions, out, count, WIDTH=levels**2, BLOCK=BLOCK)
@@ -95,10 +92,7 @@ class _Frequency(torch.autograd.Function):
 
 
 def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
-    """Compute `nerfloom.kernels.encodings.frequency.frequency_encoding`, with first derivatives.
-
-    `x`, `num_frequencies` and `include_input` are as there.
-    """
+    """Compute `frequency.frequency_encoding` of `x`, `num_frequencies` and `include_input`, with first derivatives."""
     rows = x.flatten(0, -2).contiguous()
     return _Frequency.apply(rows, num_frequencies, include_input).unflatten(0, x.shape[:-1])
 
@@ -171,8 +165,5 @@ class _Contract(torch.autograd.Function):
 
 
 def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
-    """Compute `nerfloom.kernels.encodings.contraction.contract_to_unit`, with the gradient of the positions.
-
-    `positions` and `box` are as there.
-    """
+    """Compute `contraction.contract_to_unit` of `positions` and `box`, with the gradient of the positions."""
     return _Contract.apply(positions.contiguous(), box)

@@ -19,10 +19,7 @@ _backward = native.Function("frequency_encoding_backward", "ppqiiipi")
 
 
 def frequency_encoding_reference(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
-    """Compute `frequency_encoding` in PyTorch, on any device.
-
-    `x`, `num_frequencies` and `include_input` are as in `frequency_encoding`.
-    """
+    """Compute `frequency_encoding` of `x`, `num_frequencies` and `include_input` in PyTorch, on any device."""
     x = _widened(x)
     scales = 2.0 ** torch.arange(num_frequencies, device=x.device, dtype=x.dtype)
     angles = x[..., None, :] * scales[:, None]

@@ -126,9 +126,6 @@ class _DirectionalEncoding(torch.autograd.Function):
 
 
 def directional_encoding(directions: Tensor, roughness: Tensor, bands: int = MAX_BANDS) -> Tensor:
-    """Compute `nerfloom.kernels.encodings.integrated_directional.directional_encoding`, with first derivatives.
-
-    `directions`, `roughness` and `bands` are as there.
-    """
+    """Compute `directional_encoding` of `directions`, `roughness` and `bands`, with first derivatives."""
     found: Tensor = _DirectionalEncoding.apply(directions.contiguous(), roughness.contiguous(), bands)
     return found

@@ -66,10 +66,7 @@ def _signed(strides: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
-    """Compute `hash_grid` in PyTorch, for any device and float type, with derivatives of any order.
-
-    `positions`, `table`, `layout` and the result are as in `hash_grid`.
-    """
+    """Compute `hash_grid` of `positions`, `table` and `layout` in PyTorch, with derivatives of any order."""
     features = []
     for level, offset in enumerate(layout.offsets[:-1]):
         entries, weights, _ = corners(positions, layout, level)

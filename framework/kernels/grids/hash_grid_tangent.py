@@ -24,10 +24,7 @@ LOOK_UP = LookUp("hash_grid_tangent", "points", ("N", 6), _forward, _backward_ta
 
 
 def hash_grid_tangent_reference(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
-    """Compute `hash_grid_tangent` in PyTorch, for any device and float type, with derivatives of any order.
-
-    `points`, `table`, `layout` and the result are as there.
-    """
+    """Compute `hash_grid_tangent` of `points`, `table` and `layout` in PyTorch, with derivatives of any order."""
     # The gradient of weighted features is linear in the weights: its derivatives by them, along a direction, are the
     # derivatives of the features. The first use of PyTorch's forward mode would load decompositions, which takes
     # seconds.

@@ -169,10 +169,5 @@ class _HashGrid(torch.autograd.Function):
 
 
 def hash_grid(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
-    """Compute `nerfloom.kernels.grids.hash_grid.hash_grid`, with first derivatives, for 1, 2, 4 or 8 features.
-
-    Autograd accumulates the gradient of the table: `deferred` is not used.
-
-    `positions`, `table` and `layout` are as there.
-    """
+    """Compute `hash_grid` of `positions`, `table` and `layout`; autograd has the gradient instead of `deferred`."""
     return _HashGrid.apply(positions.contiguous(), table.contiguous(), layout)

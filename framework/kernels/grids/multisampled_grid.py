@@ -23,10 +23,7 @@ from nerfloom.kernels.grids.hash_grid_lookup import LookUp, TableGradient
 
 
 def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
-    """Compute `multisampled_grid` in PyTorch, for any device and float type, with derivatives of any order.
-
-    `points`, `table`, `layout` and the result are as in `multisampled_grid`.
-    """
+    """Compute `multisampled_grid` of `points`, `table` and `layout` in PyTorch, with derivatives of any order."""
     positions, deviations = points[..., :3].flatten(0, 1), points[..., 3].detach().flatten()
     shares = level_weights(deviations, _resolutions(layout, points.dtype, points.device)).to(table.dtype)
     features = []

@@ -29,10 +29,7 @@ MAX_HELD = 2**26
 
 
 def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
-    """Compute `planes` in PyTorch, on any device and for any float type, with derivatives of any order.
-
-    `positions`, `table`, `layout` and the result are as in `planes`.
-    """
+    """Compute `planes` of `positions`, `table` and `layout` in PyTorch, with derivatives of any order."""
     clamped, features = between(positions, 0.0, 1.0), []
     for group, resolution in enumerate(layout.resolutions):
         vertices = torch.tensor(resolution, device=positions.device)

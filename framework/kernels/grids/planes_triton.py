@@ -182,10 +182,5 @@ class _Planes(torch.autograd.Function):
 
 
 def planes(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None) -> Tensor:
-    """Compute `nerfloom.kernels.grids.planes.planes`, with first derivatives.
-
-    Autograd accumulates the gradient of the table: `deferred` is not used.
-
-    `positions`, `table` and `layout` are as there.
-    """
+    """Compute `planes.planes` of `positions`, `table` and `layout`; autograd has the gradient instead of `deferred`."""
     return _Planes.apply(positions.contiguous(), table.contiguous(), layout)

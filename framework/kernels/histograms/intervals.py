@@ -85,10 +85,7 @@ class _Weights(torch.autograd.Function):
 def resample_reference(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
 ) -> Tensor:
-    """Compute `resample` in PyTorch, on any device and for any float type.
-
-    `edges`, `weights`, `shift`, `count`, `power` and `padding` are as in `resample`.
-    """
+    """Compute `resample` of `edges`, `weights`, `shift`, `count`, `power` and `padding` in PyTorch."""
     heavy = weights.to(torch.promote_types(weights.dtype, edges.dtype)) ** power + padding
     cdf = torch.cat([torch.zeros_like(heavy[:, :1]), heavy.cumsum(-1)], dim=-1)
     steps = torch.arange(count + 1, device=edges.device)
@@ -151,10 +148,7 @@ _resample_intervals = native.Function("resample_intervals", "pppqqqffpi")
 
 
 def proposal_excess_reference(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-    """Compute `proposal_excess` in PyTorch from all pairs of intervals, for any float type.
-
-    `edges`, `weights`, `proposed` and `proposed_weights` are as in `proposal_excess`.
-    """
+    """Compute `proposal_excess` of `edges`, `weights`, `proposed` and `proposed_weights` from pairs of intervals."""
     touches = (proposed[:, None, :-1] <= edges[:, 1:, None]) & (proposed[:, None, 1:] >= edges[:, :-1, None])
     bound = (touches * proposed_weights[:, None, :]).sum(-1)
     return ((weights - bound).clamp(min=0).square() / (weights + EPS)).sum(-1)

@@ -155,10 +155,7 @@ def _resample(edges, weights, shift, power, sums, out, bins, count, padding, ste
 def resample(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
 ) -> Tensor:
-    """Compute `nerfloom.kernels.histograms.intervals.resample`.
-
-    `edges`, `weights`, `shift`, `count`, `power` and `padding` are as there.
-    """
+    """Compute `intervals.resample` of `edges`, `weights`, `shift`, `count`, `power` and `padding`."""
     rays, bins = weights.shape
     out, sums = edges.new_empty(rays, count + 1), edges.new_empty(rays, bins, dtype=torch.float64)
     launch(
@@ -237,8 +234,5 @@ class _Excess(torch.autograd.Function):
 
 
 def proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-    """Compute `nerfloom.kernels.histograms.intervals.proposal_excess`, with the gradient of the proposed weights.
-
-    `edges`, `weights`, `proposed` and `proposed_weights` are as there.
-    """
+    """Compute `intervals.proposal_excess` of `edges`, `weights`, `proposed` and `proposed_weights`, with a gradient."""
     return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)), EPS)

@@ -58,10 +58,7 @@ def blurred_weights(edges: Tensor, weights: Tensor, proposed: Tensor, radius: fl
 def blurred_excess_reference(
     edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float
 ) -> Tensor:
-    """Compute `blurred_excess` in PyTorch, on any device.
-
-    `edges`, `weights`, `proposed`, `proposed_weights` and `radius` are as in `blurred_excess`.
-    """
+    """Compute `blurred_excess` of `edges`, `weights`, `proposed`, `proposed_weights` and `radius` in PyTorch."""
     target = blurred_weights(edges, weights, proposed, radius).to(proposed_weights)
     excess = (target - proposed_weights).clamp(min=0)
     return (excess.square() / (proposed_weights + EPS)).sum(-1)

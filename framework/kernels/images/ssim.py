@@ -131,10 +131,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights:
 
 
 def photometric_reference(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
-    """Compute `photometric_loss` in torch, with derivatives of any order by both images.
-
-    `image`, `target`, `ssim_weight` and `weights` are as there.
-    """
+    """Compute `photometric_loss` of `image`, `target`, `ssim_weight` and `weights` in torch, with all derivatives."""
     by_means, by_variances = _similarities(image, target)
     dissimilar = 1 - by_means * by_variances
     if weights is not None:

@@ -165,10 +165,7 @@ class _SSIM(torch.autograd.Function):
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
-    """Compute `nerfloom.kernels.images.ssim.photometric_loss`, with the first derivative by the image.
-
-    `image`, `target`, `ssim_weight` and `weights` are as there.
-    """
+    """Compute `ssim.photometric_loss` of `image`, `target`, `ssim_weight` and `weights`, with its first derivative."""
     learned = image.requires_grad and torch.is_grad_enabled()
     similarity = _SSIM.apply(image.contiguous(), target.contiguous(), weights, learned)
     return (1 - ssim_weight) * weighted_error(image, target, weights) + ssim_weight * (1 - similarity)

@@ -139,10 +139,7 @@ def fill(
 def fill_reference(
     rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, capacities: tuple[int, int]
 ) -> Filled:
-    """Compute `fill` in PyTorch, on any device.
-
-    `rays`, `occupancy`, `step`, `num_steps`, `shift` and `capacities` are as in `fill`.
-    """
+    """Compute `fill` of `rays`, `occupancy`, `step`, `num_steps`, `shift` and `capacities` in PyTorch."""
     count, device, (runs_capacity, capacity) = len(rays), rays.origins.device, capacities
     enter, leave, first, steps = step_range(rays, occupancy, step, 0.0, shift)
     slices = occupancy.slices_of(rays.times)

@@ -36,10 +36,7 @@ def mlp_reference(
     activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
 ) -> Tensor:
-    """Compute `mlp` in PyTorch, on any device and for any float type, with derivatives of any order.
-
-    `inputs`, `weights`, `activation` and `biases` are as in `mlp`.
-    """
+    """Compute `mlp` of `inputs`, `weights`, `activation` and `biases` in PyTorch, with derivatives of any order."""
     x = torch.cat([part.to(weights[0].dtype) for part in inputs], dim=-1)
     for layer, weight in enumerate(weights):
         x = linear(torch.relu(x) if layer else x, weight, None if biases is None else biases[layer])

@@ -228,10 +228,9 @@ def trace_octree(
     layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float = 0.0,
     deferred: tuple[RowGradient, RowGradient] | None = None, peaks: Tensor | None = None,
 ) -> OctreeLight:  # fmt: skip
-    """Compute `nerfloom.kernels.octree.trace.trace_octree`, with first derivatives of the leaves.
+    """Compute `trace.trace_octree` of `layout`, `raw`, `coefficients`, `rays`, `background`, `stop` and `peaks`.
 
-    Autograd accumulates the gradients: `deferred` is not used. `layout`, `raw`, `coefficients`, `rays`, `background`,
-    `stop` and `peaks` are as there.
+    Autograd accumulates the gradients of the leaves: `deferred` is not used.
     """
     inputs = raw.contiguous(), coefficients.contiguous()
     return OctreeLight(*_Trace.apply(*inputs, layout, contiguous(rays), background.contiguous(), stop, peaks))
@@ -240,10 +239,7 @@ def trace_octree(
 def trace_packed(
     layout: OctreeLayout, leaves: PackedLeaves, rays: Rays, background: Tensor, stop: float = 0.0
 ) -> OctreeLight:
-    """Compute `nerfloom.kernels.octree.packed.trace_packed`.
-
-    `layout`, `leaves`, `rays`, `background` and `stop` are as there.
-    """
+    """Compute `packed.trace_packed` of `layout`, `leaves`, `rays`, `background` and `stop`."""
     smallest, rays = smallest_cells(rays), contiguous(rays)
     out = outputs_of(rays)[0]
     _run(
@@ -254,10 +250,7 @@ def trace_packed(
 
 
 def raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tensor, stop: float = 0.0) -> Tensor:
-    """Compute `nerfloom.kernels.octree.weights.raise_weights`.
-
-    `layout`, `raw`, `rays`, `weights` and `stop` are as there.
-    """
+    """Compute `weights.raise_weights` of `layout`, `raw`, `rays`, `weights` and `stop`."""
     rays, opacity = contiguous(rays), torch.empty_like(rays.fars)
     out = None, opacity, None, None, None
     _run(layout, rays, stop, None, raw.contiguous(), None, None, (None, None), None, out, weights)

@@ -270,8 +270,8 @@ class _Blend(torch.autograd.Function):
 def blend(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
-    """Compute `nerfloom.kernels.splats.blend.blend`, with first derivatives of images of 3 or 4 channels.
+    """Compute `blend.blend` of `records`, `lists`, `width`, `height`, `background`, `channels` and `median`.
 
-    `records`, `lists`, `width`, `height`, `background`, `channels` and `median` are as there.
+    Images of 3 or 4 channels have first derivatives.
     """
     return Blended(*_Blend.apply(records.contiguous(), lists, width, height, background.contiguous(), channels, median))

@@ -88,23 +88,12 @@ def project_packed(packed: PackedGaussians, camera: SplatCamera, degree: int = 3
 
 
 def packed_sort_keys(packed: PackedGaussians, camera: SplatCamera) -> Tensor | None:
-    """Return the keys (B * PACK,) of `sort_keys` for packed Gaussians.
-
-    Args:
-        packed: B blocks of Gaussians.
-        camera: the camera.
-    """
+    """Return the keys (B * PACK,) of `sort_keys` of `packed` Gaussians for a `camera`."""
     return sort_keys(packed.values[:, : WIDTHS[0]].transpose(1, 2).reshape(-1, WIDTHS[0]), camera)
 
 
 def project_packed_reference(packed: PackedGaussians, camera: SplatCamera, basis: int) -> Tensor:
-    """Compute `project_packed` in torch.
-
-    Args:
-        packed: B blocks of Gaussians.
-        camera: the camera.
-        basis: number of harmonics that are used beyond the first: 0, 3, 8 or 15.
-    """
+    """Compute `project_packed` of `packed` and `camera` in torch; `basis` is as in `project_reference`."""
     rows = packed.values.transpose(1, 2).flatten(0, 1)
     means, log_scales, rotations, logits, colors = rows.split(WIDTHS, 1)
     harmonics = packed.harmonics.permute(0, 3, 1, 2).flatten(0, 1).to(rows)

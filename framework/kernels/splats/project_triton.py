@@ -278,14 +278,10 @@ def project_gaussians(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Compute `nerfloom.kernels.splats.project.project_gaussians` for a pinhole camera, with first derivatives.
+    """Compute `project.project_reference` for a pinhole camera, with first derivatives.
 
-    The number of Gaussians that are left out stays on the GPU.
-
-    Args:
-        means, log_scales, rotations, logits, colors, harmonics: parameters of the Gaussians.
-        camera: the camera.
-        basis: number of harmonics that are used beyond the first: 0, 3, 8 or 15.
+    `means`, `log_scales`, `rotations`, `logits`, `colors`, `harmonics`, `camera` and `basis` are as there. The number
+    of Gaussians that are left out stays on the GPU.
     """
     tensors = [t.contiguous() for t in (means, log_scales, rotations, logits, colors, harmonics, camera.pose)]
     dropped = torch.zeros((), dtype=torch.int64, device=means.device)

@@ -96,10 +96,9 @@ def tile_lists(
     records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
-    """Compute `nerfloom.kernels.splats.tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
+    """Compute `tiles.tile_lists` of `records`, `width`, `height`, `for_gradients`, `capacity` and `keys`.
 
-    A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone. The first Gaussians have the
-    `capacity`. They are sorted by `keys`, if there are some.
+    A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone.
 
     Raises:
         ValueError: if there are 2^31 entries or more.

@@ -135,12 +135,7 @@ def distance_network(
     positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout,
     deferred: TableGradient | None,
 ) -> Tensor:  # fmt: skip
-    """Compute `nerfloom.kernels.surfaces.distance.distance_network`, for 1, 2, 4 or 8 features.
-
-    Autograd accumulates the gradient of the table: `deferred` is not used.
-
-    `positions`, `table`, `first`, `second` and `layout` are as there.
-    """
+    """Compute `distance_network` of `positions`, `table`, `first`, `second` and `layout`; `deferred` is not used."""
     with torch.autocast(positions.device.type, enabled=False):
         contiguous = positions.contiguous(), table.contiguous(), first.contiguous(), second.contiguous()
         return _DistanceNetwork.apply(*contiguous, layout)

@@ -113,10 +113,7 @@ def surface_samples(
 def surface_samples_reference(
     network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Compute `surface_samples` in PyTorch, for any device and float type, with derivatives of any order.
-
-    `network`, `sharpness`, `positions`, `first`, `intervals` and the result are as there.
-    """
+    """Compute `surface_samples` of `network`, `sharpness`, `positions`, `first` and `intervals` in PyTorch."""
     placed = (positions - first.centre) / first.size
     return stopped_samples(*first_distance(network, positions, first), network[:, 1:-3], placed, sharpness, intervals)
 

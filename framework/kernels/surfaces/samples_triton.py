@@ -171,10 +171,7 @@ def _constants(outputs: int, rows: Any) -> dict[str, Any]:
 def surface_samples(
     network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Compute `nerfloom.kernels.surfaces.samples.surface_samples`.
-
-    `network`, `sharpness`, `positions`, `first` and `intervals` are as there.
-    """
+    """Compute `samples.surface_samples` of `network`, `sharpness`, `positions`, `first` and `intervals`."""
     rows, annealing = [positions.contiguous()], 1.0
     if intervals is not None:
         rows += [intervals.directions.contiguous(), intervals.lengths.contiguous()]

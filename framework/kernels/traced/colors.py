@@ -62,10 +62,7 @@ def traced_colors(marched: March, density: GridDensity, color: GridColor, backgr
 
 
 def traced_colors_reference(marched: March, density: GridDensity, color: GridColor, background: Tensor) -> TracedColors:
-    """Compute `traced_colors` in PyTorch and single operations, on any device.
-
-    `marched`, `density`, `color` and `background` are as in `traced_colors`.
-    """
+    """Compute `traced_colors` of `marched`, `density`, `color` and `background` in PyTorch, in single operations."""
     traced, rays = trace(marched, density), marched.rays
     inputs = [traced.features]
     if color.bands:

@@ -17,6 +17,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.kernels.histograms.intervals import EPS
+from nerfloom.kernels.known_gradient import KnownGradient
 from nerfloom.kernels.triton_launch import depth_slope, launch, on_device, opacity_of, optical_depth
 
 BLOCK = 64
@@ -210,29 +211,16 @@ def _excess(
         tl.store(of_weights + j, (-2 * change).to(tl.float32), mask=here)
 
 
-class _Excess(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, eps: float
-    ) -> Tensor:
-        (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
-        loss, of_weights = weights.new_empty(rays), torch.empty_like(proposed_weights)
-        sums, scaled = (weights.new_empty(rays, size, dtype=torch.float64) for size in (proposed_bins, bins))
-        steps = max(bins, proposed_bins).bit_length()
-        launch(
-            _excess, (rays,), edges, weights, proposed, proposed_weights, sums, scaled, loss, of_weights, bins,
-            proposed_bins, steps, eps, BLOCK=BLOCK, num_warps=1,
-        )  # fmt: skip
-        ctx.save_for_backward(of_weights)
-        return loss
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor, None]:
-        (of_weights,) = ctx.saved_tensors
-        return None, None, None, of_weights * grad[:, None], None
-
-
 def proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
     """Compute `intervals.proposal_excess` of `edges`, `weights`, `proposed` and `proposed_weights`, with a gradient."""
-    return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)), EPS)
+    inputs = (tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights))
+    edges, weights, proposed, proposed_weights = inputs
+    (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
+    loss, of_weights = weights.new_empty(rays), torch.empty_like(proposed_weights)
+    sums, scaled = (weights.new_empty(rays, size, dtype=torch.float64) for size in (proposed_bins, bins))
+    steps = max(bins, proposed_bins).bit_length()
+    launch(
+        _excess, (rays,), edges, weights, proposed, proposed_weights, sums, scaled, loss, of_weights, bins,
+        proposed_bins, steps, EPS, BLOCK=BLOCK, num_warps=1,
+    )  # fmt: skip
+    return KnownGradient.apply((loss, of_weights), proposed_weights)

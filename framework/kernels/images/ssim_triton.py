@@ -10,7 +10,6 @@ blurs three maps in the same way. An element of a map is a value of the image, w
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import torch
 import triton
@@ -18,6 +17,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.kernels.images.ssim import C1, C2, SIGMA, WINDOW, least_in_windows, weighted_error
+from nerfloom.kernels.known_gradient import KnownGradient
 from nerfloom.kernels.triton_launch import blocks, launch, own_rows
 
 BLOCK = 256
@@ -130,42 +130,33 @@ def _rows_back(
     tl.store(derivative + i, scale * (one + 2 * (a + b - 1) * two + 2 * (a - b) * three), mask=here)
 
 
-class _SSIM(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, weights: Tensor | None, learned: bool) -> Tensor:
-        height, width, channels = image.shape
-        line, constants = _line(image.device), {"WINDOW": WINDOW, "BLOCK": BLOCK}
-        row, shorter, windows = width * channels, (width - WINDOW + 1) * channels, height - WINDOW + 1
-        size, count = height * shorter, windows * shorter
-        maps, sums = image.new_empty(4, size), image.new_empty(blocks(count, BLOCK))
-        slopes = image.new_empty(3, count) if learned else None
-        launch(_rows, (blocks(size, BLOCK),), image, target, line, maps, size, row, shorter, channels, **constants)
-        least = None if weights is None else least_in_windows(weights).contiguous()
-        launch(
-            _windows, (blocks(count, BLOCK),), maps, line, least, sums, slopes, size, count, shorter, channels, C1, C2,
-            **constants,
-        )  # fmt: skip
-        if slopes is not None:
-            derivative = torch.empty_like(image)
-            launch(
-                _columns_back, (blocks(size, BLOCK),), slopes, line, maps, count, size, shorter, windows, **constants
-            )
-            launch(
-                _rows_back, (blocks(image.numel(), BLOCK),), maps, line, image, target, derivative, size,
-                image.numel(), row, shorter, channels, 1 / count, **constants,
-            )  # fmt: skip
-            ctx.save_for_backward(derivative)
-        return (1 - sums.double().sum() / count).to(image.dtype)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        (derivative,) = ctx.saved_tensors
-        return derivative * grad, None, None, None
+def _ssim(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+    """Return the mean SSIM of contiguous images, and its derivative by the first if that is followed."""
+    height, width, channels = image.shape
+    line, constants = _line(image.device), {"WINDOW": WINDOW, "BLOCK": BLOCK}
+    row, shorter, windows = width * channels, (width - WINDOW + 1) * channels, height - WINDOW + 1
+    size, count = height * shorter, windows * shorter
+    maps, sums = image.new_empty(4, size), image.new_empty(blocks(count, BLOCK))
+    slopes = image.new_empty(3, count) if image.requires_grad and torch.is_grad_enabled() else None
+    launch(_rows, (blocks(size, BLOCK),), image, target, line, maps, size, row, shorter, channels, **constants)
+    least = None if weights is None else least_in_windows(weights).contiguous()
+    launch(
+        _windows, (blocks(count, BLOCK),), maps, line, least, sums, slopes, size, count, shorter, channels, C1, C2,
+        **constants,
+    )  # fmt: skip
+    value = (1 - sums.double().sum() / count).to(image.dtype)
+    if slopes is None:
+        return value
+    derivative = torch.empty_like(image)
+    launch(_columns_back, (blocks(size, BLOCK),), slopes, line, maps, count, size, shorter, windows, **constants)
+    launch(
+        _rows_back, (blocks(image.numel(), BLOCK),), maps, line, image, target, derivative, size, image.numel(), row,
+        shorter, channels, 1 / count, **constants,
+    )  # fmt: skip
+    return KnownGradient.apply((value, derivative), image)
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
     """Compute `ssim.photometric_loss` of `image`, `target`, `ssim_weight` and `weights`, with its first derivative."""
-    learned = image.requires_grad and torch.is_grad_enabled()
-    similarity = _SSIM.apply(image.contiguous(), target.contiguous(), weights, learned)
+    similarity = _ssim(image.contiguous(), target.contiguous(), weights)
     return (1 - ssim_weight) * weighted_error(image, target, weights) + ssim_weight * (1 - similarity)

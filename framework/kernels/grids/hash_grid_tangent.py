@@ -14,7 +14,7 @@ from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.grids.hash_grid import hash_grid_reference
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
-from nerfloom.kernels.grids.hash_grid_lookup import LookUp
+from nerfloom.kernels.grids.hash_grid_lookup import LookUp, fits
 
 _forward = native.Function("hash_grid_tangent_forward", "pqpippipi")
 _backward_table = native.Function("hash_grid_tangent_backward_table", "pppiippipi")
@@ -62,11 +62,7 @@ def hash_grid_tangent(points: Tensor, table: Tensor, layout: HashGridLayout) -> 
 HASH_GRID_TANGENT = Operation("hash_grid_tangent", hash_grid_tangent_reference)
 
 
-def _fits(points: Tensor, table: Tensor, layout: HashGridLayout) -> bool:
-    return table.shape[1] in (1, 2, 4, 8)
-
-
-@HASH_GRID_TANGENT.implementation(CPP, order=0, differentiable=0, fits=_fits)
+@HASH_GRID_TANGENT.implementation(CPP, order=0, differentiable=0, fits=fits)
 def _compiled(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
     points, table = points.contiguous(), table.contiguous()
     features = table.shape[1]

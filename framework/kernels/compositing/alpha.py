@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing.density import Composited, composite
+from nerfloom.kernels.math import at_least_float32
 
 LEFT_BEHIND = 4e-4
 """Maximum transmittance behind a sample with an alpha of 1, in float32 (`alpha_depth`)."""
@@ -33,7 +34,7 @@ def alpha_depth(alpha: Tensor) -> Tensor:
     Returns:
         Optical depth (N,), float64 if `alpha` is float64, and float32 otherwise.
     """
-    alpha = alpha if alpha.dtype == torch.float64 else alpha.float()
+    alpha = at_least_float32(alpha)
     most = 1 - torch.finfo(alpha.dtype).eps ** 0.5
     return -torch.log1p(-(alpha - (alpha - alpha.clamp(max=most)).detach()))
 

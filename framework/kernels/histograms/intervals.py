@@ -119,13 +119,7 @@ def resample(
 RESAMPLE = Operation("resample", resample_reference)
 
 
-def _power_is_known(
-    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
-) -> bool:
-    return not isinstance(power, Tensor)
-
-
-@RESAMPLE.implementation(CPP, fits=_power_is_known)
+@RESAMPLE.implementation(CPP, fits=lambda edges, weights, shift, count, power, padding: not isinstance(power, Tensor))
 def _resample(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
 ) -> Tensor:

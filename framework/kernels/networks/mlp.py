@@ -195,12 +195,7 @@ def _check_widths(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> None:
 NETWORK = Operation("mlp", mlp_reference)
 
 
-def _is_small(
-    inputs: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    activation: Activation = "none",
-    biases: Sequence[Tensor] | None = None,
-) -> bool:
+def _is_small(inputs: Sequence[Tensor], weights: Sequence[Tensor], *rest: Any, **named: Any) -> bool:
     return len(weights) <= MAX_LAYERS and all(max(weight.shape) <= MAX_WIDTH for weight in weights)
 
 
@@ -248,13 +243,7 @@ def density_mlp(
 DENSITY_NETWORK: Operation[..., tuple[Tensor, Tensor]] = Operation("density_mlp", density_mlp_reference)
 
 
-def _is_small_density(
-    inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
-) -> bool:
-    return _is_small(inputs, weights)
-
-
-@DENSITY_NETWORK.implementation(CPP, fits=_is_small_density)
+@DENSITY_NETWORK.implementation(CPP, fits=_is_small)
 def _compiled_density(
     inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:

@@ -85,10 +85,7 @@ LOOK_UP = LookUp("hash_grid", "positions", ("N", 3), _forward, _backward_table, 
 
 
 def hash_grid(
-    positions: Tensor,
-    table: Tensor,
-    layout: HashGridLayout,
-    deferred: TableGradient | None = None,
+    positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None = None
 ) -> Tensor:
     """Return the multiresolution hash encoding of positions: Instant-NGP, section 3.
 

@@ -155,14 +155,9 @@ class _InCube(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        origins: Tensor,
-        directions: Tensor,
-        columns: tuple[Tensor, ...],
-        row: tuple[int, ...],
-        to_cube: _Map,
+        ctx: Any, origins: Tensor, directions: Tensor, columns: tuple[Tensor, ...], row: tuple[int, ...], to_cube: _Map,
         kernels: tuple[native.Function, native.Function],
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         count, tensors = len(origins), [x.contiguous() for x in (origins, directions, *columns)]
         out = origins.new_empty(count, *row)
         kernels[0](

@@ -117,13 +117,7 @@ class _Planes(torch.autograd.Function):
     """The compiled form of `planes`."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        positions: Tensor,
-        table: Tensor,
-        placeholder: Tensor | None,
-        layout: PlanesLayout,
-    ) -> Tensor:
+    def forward(ctx: Any, positions: Tensor, table: Tensor, placeholder: Tensor | None, layout: PlanesLayout) -> Tensor:
         def compute() -> Tensor:
             out = positions.new_empty(len(positions), layout.num_groups * table.shape[1])
             _forward(*_arguments(positions, table, layout), out.data_ptr(), native.threads())
@@ -168,12 +162,7 @@ def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[
     return points, count, entries, *sizes, *layout.arrays
 
 
-def planes(
-    positions: Tensor,
-    table: Tensor,
-    layout: PlanesLayout,
-    deferred: PlanesGradient | None = None,
-) -> Tensor:
+def planes(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None = None) -> Tensor:
     """Return the factorised features at positions: K-Planes, section 3, and TensoRF, section 4.
 
     The compiled form has first derivatives only.

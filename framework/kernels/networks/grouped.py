@@ -89,13 +89,9 @@ def chunks_of(owners: Tensor, count: int) -> Chunks:
 
 
 def grouped_mlp_reference(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], activation: Activation = "none",
     deferred: RowGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Compute `grouped_mlp` in PyTorch, on any device and for any float type, with derivatives of any order.
 
     `inputs`, `owners`, `table`, `widths`, `activation` and `deferred` are as in `grouped_mlp`; `deferred` is not used.
@@ -116,11 +112,7 @@ def grouped_mlp_reference(
 
 
 def grouped_density_mlp_reference(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    deferred: RowGradient | None = None,
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], deferred: RowGradient | None = None
 ) -> tuple[Tensor, Tensor]:
     """Compute `grouped_density_mlp` in PyTorch, on any device and for any float type.
 
@@ -131,13 +123,9 @@ def grouped_density_mlp_reference(
 
 
 def grouped_mlp(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], activation: Activation = "none",
     deferred: RowGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Return the outputs of rows of many fully connected networks, with ReLU between their layers.
 
     Row n is the output of network `owners[n]`, as `mlp` computes it with the weights and biases of this network alone.
@@ -163,11 +151,7 @@ def grouped_mlp(
 
 
 def grouped_density_mlp(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    deferred: RowGradient | None = None,
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], deferred: RowGradient | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return the density (N,) and features (N, D_out) of networks with the log-density as first output.
 
@@ -338,24 +322,16 @@ def _is_small(inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: S
 
 @GROUPED_NETWORK.implementation(CPP, fits=_is_small)
 def _compiled(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], activation: Activation = "none",
     deferred: RowGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     out: Tensor = _apply(_Plan(tuple(widths), activation, False), inputs, owners, table, deferred)
     return out
 
 
 @GROUPED_DENSITY_NETWORK.implementation(CPP, fits=_is_small)
 def _compiled_density(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    deferred: RowGradient | None = None,
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], deferred: RowGradient | None = None
 ) -> tuple[Tensor, Tensor]:
     density, features = _apply(_Plan(tuple(widths), "none", True), inputs, owners, table, deferred)
     return density, features

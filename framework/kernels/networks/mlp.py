@@ -31,11 +31,9 @@ MAX_LAYERS = 8
 
 
 def mlp_reference(
-    inputs: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Compute `mlp` of `inputs`, `weights`, `activation` and `biases` in PyTorch, with derivatives of any order."""
     x = torch.cat([part.to(weights[0].dtype) for part in inputs], dim=-1)
     for layer, weight in enumerate(weights):
@@ -159,11 +157,9 @@ class _Call:
 
 
 def mlp(
-    inputs: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Return the output of a fully connected network with ReLU between its layers.
 
     The compiled form has first derivatives only. Under autocast it multiplies in bfloat16 and sums in float32 if the
@@ -201,11 +197,9 @@ def _is_small(inputs: Sequence[Tensor], weights: Sequence[Tensor], *rest: Any, *
 
 @NETWORK.implementation(CPP, fits=_is_small)
 def _compiled(
-    inputs: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     return _apply(_Plan(len(inputs), len(weights), activation, multiplies_bf16()), inputs, weights, biases)
 
 

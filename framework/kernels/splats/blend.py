@@ -59,14 +59,9 @@ class Blended(NamedTuple):
 
 
 def blend(
-    records: Tensor,
-    lists: TileLists,
-    width: int,
-    height: int,
-    background: Tensor,
-    channels: int = 3,
+    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int = 3,
     median: bool = False,
-) -> Blended:
+) -> Blended:  # fmt: skip
     """Blend the Gaussians on an image.
 
     Columns ABSOLUTE_X and ABSOLUTE_Y of the records' gradient hold sums of absolute gradients.

@@ -119,13 +119,9 @@ def surface_samples_reference(
 
 
 def stopped_samples(
-    distances: Tensor,
-    gradients: Tensor,
-    features: Tensor,
-    placed: Tensor,
-    sharpness: Tensor,
+    distances: Tensor, gradients: Tensor, features: Tensor, placed: Tensor, sharpness: Tensor,
     intervals: Intervals | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return opacity or density at samples of any distance, and the inputs of their colour, as `surface_samples` does.
 
     Args:
@@ -178,15 +174,9 @@ def _compiled(
 class _Samples(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        network: Tensor,
-        sharpness: Tensor,
-        first: FirstShape,
-        annealing: float,
-        positions: Tensor,
-        directions: Tensor | None,
-        lengths: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
+        ctx: Any, network: Tensor, sharpness: Tensor, first: FirstShape, annealing: float, positions: Tensor,
+        directions: Tensor | None, lengths: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         ctx.save_for_backward(network, sharpness, positions, directions, lengths)
         ctx.first, ctx.annealing = first, annealing
         count, width = network.shape
@@ -213,14 +203,9 @@ class _Samples(torch.autograd.Function):
 
 
 def _arguments(
-    network: Tensor,
-    sharpness: Tensor,
-    first: FirstShape,
-    annealing: float,
-    positions: Tensor,
-    directions: Tensor | None,
-    lengths: Tensor | None,
-) -> tuple[Any, ...]:
+    network: Tensor, sharpness: Tensor, first: FirstShape, annealing: float, positions: Tensor,
+    directions: Tensor | None, lengths: Tensor | None,
+) -> tuple[Any, ...]:  # fmt: skip
     """Return the leading arguments that both compiled functions have."""
     count = len(network)
     return (

@@ -93,7 +93,7 @@ def _check(image: Tensor, target: Tensor) -> None:
         raise ValueError(f"SSIM needs two images (H, W, C), not {tuple(image.shape)} and {tuple(target.shape)}")
 
 
-def _check_window(image: Tensor, counted: Tensor | None = None) -> None:
+def _check_window(image: Tensor, counted: Tensor | None) -> None:
     height, width = image.shape[:2]
     if min(height, width) < WINDOW:
         raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {width}x{height}")
@@ -149,11 +149,6 @@ def weighted_error(image: Tensor, target: Tensor, weights: Tensor | None) -> Ten
     """
     errors = (image - target).abs()
     return errors.mean() if weights is None else (errors * weights[..., None]).mean()
-
-
-def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
-    """Compute `ssim` of all windows of `image` and `target` in torch, with derivatives of any order by both."""
-    return similarity_reference(image, target, None, True)
 
 
 def structure(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor:

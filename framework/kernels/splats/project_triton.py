@@ -25,8 +25,6 @@ from nerfloom.kernels.splats.record_triton import (
     DISTANCE,
     GREEN,
     NORMAL_X,
-    NORMAL_Y,
-    NORMAL_Z,
     OPACITY,
     REACH_X,
     REACH_Y,
@@ -53,7 +51,7 @@ from nerfloom.kernels.splats.shapes_triton import (
     to_camera,
     towards,
 )
-from nerfloom.kernels.triton_launch import blocks, launch, load_three, own_rows
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, own_rows, store_three
 
 BLOCK = 128
 """Gaussians that are taken together."""
@@ -78,9 +76,7 @@ def _put_normal(record, here, r00, r01, r02, r10, r11, r12, r20, r21, r22, s0, s
     n1 = tl.where(third, r12, tl.where(second, r11, r10))
     n2 = tl.where(third, r22, tl.where(second, r21, r20))
     sign = tl.where(n0 * x + n1 * y + n2 * z > 0, -1.0, 1.0)
-    tl.store(record + NORMAL_X, sign * n0, mask=here)
-    tl.store(record + NORMAL_Y, sign * n1, mask=here)
-    tl.store(record + NORMAL_Z, sign * n2, mask=here)
+    store_three(record + NORMAL_X, sign * n0, sign * n1, sign * n2, here)
 
 
 @triton.jit

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -147,11 +147,9 @@ def _levels(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) ->
     )
 
 
-def _has_int32_indices(*given: Any) -> bool:
-    return given[2].num_entries < 2**31
-
-
-@HASH_GRID.implementation(FEW_OPERATIONS, types=None, order=torch.inf, fits=_has_int32_indices)
+@HASH_GRID.implementation(  # with indices in 32 bits
+    FEW_OPERATIONS, types=None, order=torch.inf, fits=lambda positions, table, layout, _: layout.num_entries < 2**31
+)
 def _all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
     """Compute `hash_grid` with one set of operations for all levels, for any device and float type."""
     held = 8 * layout.num_levels * table.shape[1]

@@ -82,7 +82,6 @@ class PlanesGradient(DeferredGradient):
 
     @property
     def gradients(self) -> list[Tensor]:
-        """The collected gradients of look-ups, of bands and of their variation."""
         return [grad for _, grad in (*self.parts, *self.bands, *self.variations)]
 
     @property

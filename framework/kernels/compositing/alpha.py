@@ -58,18 +58,10 @@ def composite_alpha(samples: Samples, alpha: Tensor, rgb: Tensor, background: Te
     """Composite packed samples with alphas.
 
     Weights differ from the products T_i alpha_i by at most sqrt(eps) of the type of `alpha` (3.5e-4 in float32).
+    `rgb`, `background`, `fars`, the result and errors are as in `composite`.
 
     Args:
         samples: N samples of R rays; only their order and t are used.
         alpha: (N,) opacity of each sample in [0, 1].
-        rgb: (N, 3) colour in [0, 1].
-        background: (R, 3) or (3,) colour in [0, 1] of the background.
-        fars: (R,) distance of the far end of each ray.
-
-    Returns:
-        Colour, opacity and depth of R rays, and the weights.
-
-    Raises:
-        IndexError: if the offsets of the samples do not divide them between the rays.
     """
     return composite(*unit_intervals(samples, alpha), rgb, background, fars)

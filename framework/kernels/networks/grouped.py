@@ -157,18 +157,7 @@ def grouped_density_mlp(
 
     It equals `nerfloom.kernels.math.split_density` of `grouped_mlp`, except that the first feature is the number of the
     row's network, without a gradient, so that other networks of the same cells can follow. Numbers below 2^24 are
-    exact.
-
-    Args:
-        inputs: parts (N, D_i) of the input, as in `grouped_mlp`.
-        owners: (N,) int64 network of each row.
-        table: (C, P) parameters of C networks, as in `layers_of`.
-        widths: number of features of the input, of each hidden layer, and of the output.
-        deferred: collects the gradient of the table, on compiled kernels; None to return it.
-
-    Raises:
-        ValueError: if the widths do not fit the inputs or the table.
-        IndexError: if a row's network does not exist.
+    exact. `inputs`, `owners`, `table`, `widths`, `deferred` and errors are as in `grouped_mlp`.
     """
     _check_shapes(inputs, owners, table, widths)
     return GROUPED_DENSITY_NETWORK((*inputs, table), inputs, owners, table, widths, deferred)

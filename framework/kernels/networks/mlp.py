@@ -220,15 +220,7 @@ def density_mlp(
     """Return the density (N,) and the outputs (N, D_out) of a network with the log-density as first output.
 
     It equals `nerfloom.kernels.math.split_density` of `mlp`, without separate passes over the outputs and their
-    gradient.
-
-    Args:
-        inputs: parts (N, D_i) of the input, as in `mlp`.
-        weights: (D_out, D_in) weights of each layer.
-        biases: (D_out,) biases of each layer; None for no biases.
-
-    Raises:
-        ValueError: if the widths of inputs and layers do not fit.
+    gradient. `inputs`, `weights`, `biases` and errors are as in `mlp`.
     """
     _check_widths(inputs, weights)
     return DENSITY_NETWORK((*inputs, *weights, *(biases or ())), inputs, weights, biases)

@@ -39,15 +39,10 @@ def pack_gaussians(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     dtype: torch.dtype = torch.float32,
 ) -> PackedGaussians:  # fmt: skip
-    """Pack N Gaussians in their order; neighbours in it should be neighbours in space.
+    """Pack N Gaussians, at least one, in their order; neighbours in it should be neighbours in space.
 
     Args:
-        means: (N, 3) centres, scene coordinates; N is at least 1. All parameters are finite.
-        log_scales: (N, 3) logarithms of the standard deviations along the axes, of scene units.
-        rotations: (N, 4) quaternions w, x, y, z of any length but 0.
-        logits: (N,) opacities before the sigmoid.
-        colors: (N, 3) coefficients of the harmonic of degree 0; 0 is grey.
-        harmonics: (N, 3, K) coefficients of the degrees from 1; K is 0, 3, 8 or 15.
+        means, log_scales, rotations, logits, colors, harmonics: as in `project_gaussians`, but all finite.
         dtype: type of the stored harmonics, float32 or bfloat16.
     """
     count = len(means)

@@ -1,4 +1,4 @@
-"""Launch of kernels, and shared functions: optical depth, and an exponential without cancellation.
+"""Launch of kernels, and functions they share: rows of a program, optical depth, opacity without cancellation.
 
 Sizes are passed as numbers, not as constants of the kernel, and Triton is told not to specialise on their values. So a
 kernel is compiled once for all numbers of rays or samples. Constants are a method's sizes, such as the number of

@@ -148,7 +148,7 @@ def _levels(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) ->
 
 
 @HASH_GRID.implementation(  # with indices in 32 bits
-    FEW_OPERATIONS, types=None, order=torch.inf, fits=lambda positions, table, layout, _: layout.num_entries < 2**31
+    FEW_OPERATIONS, types=None, order=torch.inf, fits=lambda *given: given[2].num_entries < 2**31
 )
 def _all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
     """Compute `hash_grid` with one set of operations for all levels, for any device and float type."""

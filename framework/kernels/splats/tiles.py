@@ -158,7 +158,7 @@ _bound = native.Function("splat_bound", "pqiii", "q")
 _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 
-@TILES.implementation(CPP, fits=lambda records, width, height, for_gradients, capacity, keys: capacity is None)
+@TILES.implementation(CPP, fits=lambda *given: given[4] is None)  # without a capacity
 def _compiled(
     records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,

@@ -16,9 +16,10 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.evaluation.frames import write_file
 from nerfloom.evaluation.video_suffixes import VIDEO
 
-PRESET, QUALITY = "faster", 17
-"""Preset and constant rate factor of H.264. For 20 frames of a cup, error and size are those of the default preset with
-18, which is considered visually lossless, within 0.1 dB and 5 %; encoding takes about half of the time."""
+PRESET, QUALITY = "veryfast", 17
+"""Preset and constant rate factor of H.264. For 45 frames of a cup, 1920 x 1080, the error is that of the default preset
+with 18, which is considered visually lossless, within 0.1 dB; files are 7 % larger, and encoding takes a third of the
+time."""
 JPEG_QUALITY = 95
 """Quality of JPEG images, 1 to 95."""
 GIF_UNIT = 10

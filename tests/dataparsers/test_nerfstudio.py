@@ -479,6 +479,14 @@ def test_bad_content_is_refused_by_name(capture: Path, name: str) -> None:
     assert len(str(error.value)) < 300 + len(str(capture)) + 2 * (name == "endless file name")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be", "utf-32"])
+def test_encodings_of_windows(capture: Path, encoding: str) -> None:
+    # Notepad marks UTF-8, and a redirection in PowerShell writes UTF-16.
+    file = capture / "transforms.json"
+    file.write_text(file.read_text(), encoding=encoding)
+    assert worst_miss(ALL.parse(capture, "train"), poses()) < EXACT
+
+
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"text"', "\x00\xff", "[" * 100_000])
 def test_json_that_is_not_an_object(capture: Path, text: str) -> None:
     (capture / "transforms.json").write_text(text, encoding="latin-1")

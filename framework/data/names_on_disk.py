@@ -193,6 +193,20 @@ def without_ending(name: str) -> str:
     return stem if dot + ending in IMAGE_SUFFIXES else path
 
 
+def companions_of(names: Sequence[str], files: Iterable[str]) -> tuple[str | None, ...]:
+    """Return the file that accompanies each name: of its spelling (`spelled`), with an additional or another ending.
+
+    Args:
+        names: M names of images.
+        files: names of the files, relative to a folder that corresponds to that of the images.
+
+    Returns:
+        M of the `files`; None for a name without one.
+    """
+    found = {key: file for file in files for key in (without_ending(file), spelled(file))}
+    return tuple(found.get(spelled(name), found.get(without_ending(name))) for name in names)
+
+
 SPELLINGS: tuple[tuple[str, Callable[[str], str]], ...] = (
     ("", str),
     ("with other separators", _tidy),

@@ -9,7 +9,7 @@ from PIL import Image, features
 from nerfloom.base import extras
 from nerfloom.base.errors import DataError
 from nerfloom.data.image_files import image_size, read_image
-from nerfloom.processing.images import output_names, prepare, prepare_all
+from nerfloom.processing.images import output_names, prepare, prepare_all, write_masks
 from nerfloom.processing.listing import find_images
 
 
@@ -123,3 +123,22 @@ def test_damaged_photographs_are_left_out_and_named(tmp_path: Path) -> None:
     assert [p.source for p in photographs] == ["good.png"]
     assert len(unreadable) == 2
     assert "bad.png" in unreadable[0]
+
+
+def test_masks_are_found_whatever_they_are_saved_as(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ["a.png", "cam/B.JPG", "cam/c.jpg", "d.jpg", "e.jpg"]
+    for name in names:
+        write(tmp_path / "given" / name)
+    left = np.repeat([[255, 255, 255, 0, 0, 0]], 4, 0).astype(np.uint8)
+    for name in ("a.bmp", "cam/b.PNG", "cam/c.jpg.png", "d.png"):
+        (tmp_path / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(left // 255 if name == "d.png" else left).save(tmp_path / "masks" / name)
+    prepared, _ = prepare_all(tmp_path / "given", [Path(name) for name in names], tmp_path / "out")
+    written = write_masks(tmp_path / "masks", prepared, tmp_path / "written")
+    assert set(written) == {"a.png", "cam/B.jpg", "cam/c.jpg", "d.jpg"}
+    for name in written.values():
+        assert np.array_equal(np.asarray(Image.open(tmp_path / "written" / name)), left)
+    assert "1 of 5 images have no mask, the first e.jpg" in capsys.readouterr().err
+    (tmp_path / "others").mkdir()
+    with pytest.raises(DataError, match=r"has no mask; the first expected is a\.png"):
+        write_masks(tmp_path / "others", prepared, tmp_path / "written")

@@ -48,6 +48,19 @@ def test_photographs_and_videos_get_a_command_to_paste(tiny: Path, tmp_path: Pat
     assert all(f"  {kind} " in USAGE for kind in ("images", "video"))
 
 
+def test_a_folder_around_the_data_is_told_where_they_are(shared_tiny: Path, tmp_path: Path) -> None:
+    """Many archives have a folder of the same name inside, and many people keep their data sets together."""
+    (tmp_path / "my scenes").mkdir()
+    (tmp_path / "my scenes" / "a").symlink_to(shared_tiny)
+    with pytest.raises(DataError) as error:
+        find_data(tmp_path)
+    place = shlex.split(str(error.value).partition("the data is in a folder inside: --data ")[2])
+    assert place == [str(tmp_path / "my scenes" / "a")]
+    shutil.copytree(shared_tiny, tmp_path / "my scenes" / "b")
+    with pytest.raises(DataError, match="1 more folders have data"):
+        find_data(tmp_path)
+
+
 def test_the_output_has_a_name_even_for_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert processed_folder(Path(".")) == tmp_path.with_name(f"{tmp_path.name}-processed")

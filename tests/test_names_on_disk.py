@@ -62,6 +62,15 @@ def test_what_is_there_is_taken_without_a_word(tmp_path: Path, capsys: pytest.Ca
     assert ("ending" in capsys.readouterr().err) == (name == "images/c")
 
 
+def test_files_in_a_linked_folder_are_found(tmp_path: Path) -> None:
+    make(tmp_path / "disk", "a.JPG")
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "scan" / "photos").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "circle").symlink_to(tmp_path / "scan")
+    assert on_disk(tmp_path / "scan", ["photos/a.jpg"]) == (tmp_path / "scan" / "photos" / "a.JPG",)
+    assert on_disk(tmp_path / "scan", ["images/a.jpg"]) == (tmp_path / "scan" / "photos" / "a.JPG",)
+
+
 def test_absolute_names_that_exist_are_kept(tmp_path: Path) -> None:
     file = make(tmp_path / "elsewhere", "a.jpg") / "a.jpg"
     assert on_disk(tmp_path / "scan", [str(file)]) == (file,)

@@ -19,6 +19,7 @@ from pathlib import Path, PurePath
 from urllib.parse import unquote
 
 from nerfloom.base.console import say
+from nerfloom.data.folders import walk
 from nerfloom.data.suffixes import IMAGE_SUFFIXES
 
 LIKELIEST = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
@@ -121,10 +122,9 @@ def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[s
         endings: endings of the files, in lower case.
     """
     found: set[str] = set()
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        inside = Path(place).relative_to(folder)
-        suited = [name for name in names if not name.startswith(".") and name.lower().endswith(tuple(endings))]
+    for place, names in walk(folder):
+        inside = place.relative_to(folder)
+        suited = [name for name in names if name.lower().endswith(tuple(endings))]
         found |= {(inside / name).as_posix() for name in suited}
         if inside.parts and (base := _full_size(inside.parts[0])):
             found |= {Path(base, *inside.parts[1:], name).as_posix() for name in suited}
@@ -140,7 +140,7 @@ def reduced_folder(folder: Path, factor: int) -> Path:
 
 def has_images(folder: Path) -> bool:
     """Return whether a quick look finds an image in or below `folder`. Never raises."""
-    return any(_is_image(name) for _, _, names in islice(os.walk(folder), MAX_FOLDERS) for name in names)
+    return any(_is_image(name) for _, names in islice(walk(folder), MAX_FOLDERS) for name in names)
 
 
 def nearest_on_disk(path: Path) -> str:

@@ -148,11 +148,9 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
                 exif.pop(_ORIENTATION, None)
                 result = eight_bits(image) if operation is None else eight_bits(image).transpose(operation)
                 result = _cropped(result, crop)
-                options = {"exif": exif.tobytes(), "icc_profile": image.info.get("icc_profile")}
+                options = {"exif": exif.tobytes(), "icc_profile": _profile(image)}
                 save(result, target, {key: value for key, value in options.items() if value})
                 size = result.size
-    except DataError:
-        raise
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):  # a full disk is not the image's fault
             raise
@@ -225,6 +223,15 @@ def _cropped(image: Image.Image, crop: int) -> Image.Image:
     if min(width, height) <= 2 * crop:
         raise DataError(f"an image of {width}x{height} pixels has no pixels left after cropping {crop} at each side")
     return image.crop((crop, crop, width - crop, height - crop))
+
+
+def _profile(image: Image.Image) -> bytes:
+    """Return the colour profile of an image after its conversion to RGB; empty if it has none, or one of other colours.
+
+    Bytes 16 to 19 of a profile name the colours that it describes (ICC.1:2022, 7.2).
+    """
+    profile: bytes = image.info.get("icc_profile") or b""
+    return profile if profile[16:20] == b"RGB " else b""
 
 
 def _is_uniform(image: Image.Image, path: Path, ending: str) -> bool:

@@ -32,6 +32,8 @@ def test_photographs_are_found_below_and_sorted_as_people_count(tmp_path: Path) 
     assert [p.as_posix() for p in find_images(tmp_path)] == ["a 1.PNG", "b/img2.png", "b/img10.png"]
     assert [p.as_posix() for p in find_images(tmp_path, leave_out=[tmp_path / "b"])] == ["a 1.PNG"]
     (tmp_path / "c").mkdir()
+    with pytest.raises(DataError, match=r"a 1\.PNG is a file; name the folder of the images"):
+        find_images(tmp_path / "a 1.PNG")
     with pytest.raises(DataError, match="has no image"):
         find_images(tmp_path / "c")
 
@@ -142,3 +144,21 @@ def test_masks_are_found_whatever_they_are_saved_as(tmp_path: Path, capsys: pyte
     (tmp_path / "others").mkdir()
     with pytest.raises(DataError, match=r"has no mask; the first expected is a\.png"):
         write_masks(tmp_path / "others", prepared, tmp_path / "written")
+
+
+def test_profiles_of_other_colours_are_not_kept(tmp_path: Path) -> None:
+    """Programs that manage colours would take RGB for what the profile describes, or refuse the file."""
+    for colours, mode, suffix in ((b"RGB ", "P", "png"), (b"GRAY", "L", "jpg"), (b"CMYK", "CMYK", "jpg")):
+        profile = bytes(16) + colours + bytes(108)
+        name = f"{mode}.{suffix}"
+        Image.new("RGB", (6, 4), "red").convert(mode).save(tmp_path / name, icc_profile=profile)
+        prepare(tmp_path, Path(name), tmp_path / "out", name)
+        with Image.open(tmp_path / "out" / name) as image:
+            assert image.mode == "RGB"
+            assert image.info.get("icc_profile", b"") == (profile if mode == "P" else b"")
+
+
+def test_pixels_without_a_white_level_are_refused_by_name(tmp_path: Path) -> None:
+    Image.fromarray(np.ones((4, 6), np.float32)).save(tmp_path / "bright.tif")
+    with pytest.raises(DataError, match=r"bright\.tif is not a readable image: floating-point pixels; convert it"):
+        prepare(tmp_path, Path("bright.tif"), tmp_path / "out", "bright.png")

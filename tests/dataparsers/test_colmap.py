@@ -303,6 +303,20 @@ def test_images_without_their_second_line_are_refused(folder: Path) -> None:
     file.write_text("\n".join([lines[0], *lines[1::2]]) + "\n")
     with pytest.raises(DataError, match=r"images\.txt: .*'p09\.png'"):
         Colmap().parse(folder, "train")
+    file.write_text("\n".join(lines[:-1]) + "\n")  # some programs leave out the last line if it is empty
+    with pytest.raises(DataError, match=r"images\.txt ends after the first line of image 'p\d\d\.png'; .* add a line"):
+        Colmap().parse(folder, "train")
+
+
+def test_text_with_a_byte_order_mark_is_refused(folder: Path) -> None:
+    """COLMAP would take the mark for a part of the first line."""
+    for name in ("cameras", "images", "points3D"):
+        file = folder / "sparse" / "0" / f"{name}.txt"
+        text = file.read_text()
+        file.write_text(text, encoding="utf-8-sig")
+        with pytest.raises(DataError, match=rf"{name}\.txt begins with a byte-order mark.*save it without one"):
+            Colmap().parse(folder, "train")
+        file.write_text(text)
 
 
 def test_names_of_another_system(tmp_path: Path, capture: Capture, capsys: pytest.CaptureFixture[str]) -> None:

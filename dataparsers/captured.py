@@ -298,9 +298,12 @@ def _check_intrinsics(images: PosedImages, sizes: Tensor) -> None:
         # Rounding to whole pixels changes the aspect ratio of small images more.
         slack = ASPECT_TOLERANCE + 1 / min(actual)
         if abs(math.log(actual[0] * stated[1] / (actual[1] * stated[0]))) > slack:
+            remedy = "it was cropped or rotated; restore it, or remove it from the data"
+            if abs(math.log(actual[0] * stated[0] / (actual[1] * stated[1]))) <= slack:
+                # The camera's program obeys EXIF, which COLMAP and others ignore.
+                remedy = "it is stored on its side; turn such images as EXIF says: mogrify -auto-orient IMAGES"
             raise DataError(
-                f"{path} is {actual[0]}x{actual[1]} pixels, but its camera is for "
-                f"{stated[0]}x{stated[1]}: it was cropped or rotated; restore it, or remove it from the data"
+                f"{path} is {actual[0]}x{actual[1]} pixels, but its camera is for {stated[0]}x{stated[1]}: {remedy}"
             )
     lens, expected = images.lens, len(LENSES[images.model])
     if lens is not None and (lens.shape[1] != expected or not bool(lens.isfinite().all())):

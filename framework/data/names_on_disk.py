@@ -138,6 +138,19 @@ def reduced_folder(folder: Path, factor: int) -> Path:
     return folder if factor == 1 else folder.with_name(f"{folder.name}_{factor}")
 
 
+def distinct_names(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Return the ends of `paths` with the fewest parts that distinguish all files, such as left/1.jpg and right/1.jpg.
+
+    Cameras of a rig often have images of the same names in folders of their own.
+    """
+    names: tuple[str, ...] = ()
+    for count in range(1, max((len(path.parts) for path in paths), default=0) + 1):
+        names = tuple("/".join(path.parts[-count:]) for path in paths)
+        if len(set(names)) == len(set(paths)):
+            break
+    return names
+
+
 def has_images(folder: Path) -> bool:
     """Return whether a quick look finds an image in or below `folder`. Never raises."""
     return any(_is_image(name) for _, names in islice(walk(folder), MAX_FOLDERS) for name in names)

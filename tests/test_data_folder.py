@@ -48,6 +48,17 @@ def test_photographs_and_videos_get_a_command_to_paste(tiny: Path, tmp_path: Pat
     assert all(f"  {kind} " in USAGE for kind in ("images", "video"))
 
 
+def test_what_a_folder_looks_like_is_said_if_it_is_called_otherwise(
+    shared_tiny: Path, tiny: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Recipes of other programs name their formats, which many a capture is not in."""
+    assert find_data(shared_tiny, "nerfstudio") == (shared_tiny, "nerfstudio")
+    assert "looks like blender, not nerfstudio; to read it as such, leave out nerfstudio" in capsys.readouterr().err
+    assert find_data(shared_tiny, "blender") == (shared_tiny, "blender")
+    assert find_data(tiny / "train", "blender") == (tiny, "blender")
+    assert not capsys.readouterr().err
+
+
 def test_a_folder_around_the_data_is_told_where_they_are(shared_tiny: Path, tmp_path: Path) -> None:
     """Many archives have a folder of the same name inside, and many people keep their data sets together."""
     (tmp_path / "my scenes").mkdir()

@@ -59,6 +59,7 @@ def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None,
                 f"--data {folder}: the format may be {several}; name it after the flags, such as '{matches[0]}'"
             )
     if named is not None:
+        _compare(path, named)
         return path, named
     raise DataError(f"--data {path}: {_advice(path, formats)}")
 
@@ -95,6 +96,13 @@ def _recognizes(name: str, parser: type[DataParser], path: Path) -> bool:
     except Exception as error:  # an error in one plugin must not affect other formats
         say(f"warning: data format '{name}' failed to examine {path}: {type(error).__name__}: {error}; it is ignored")
         return False
+
+
+def _compare(path: Path, named: str) -> None:
+    """Report the formats that recognise a folder which the format that the user named does not recognise."""
+    formats = _formats(list(registered("dataparsers")))
+    if others := [name for name, parser in formats.items() if _recognizes(name, parser, path)]:
+        say(f"--data {path} looks like {' or '.join(others)}, not {named}; to read it as such, leave out {named}")
 
 
 def _advice(path: Path, formats: Mapping[str, type[DataParser]]) -> str:

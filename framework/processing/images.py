@@ -61,8 +61,8 @@ class PreparedImage:
 def output_names(sources: Iterable[Path]) -> list[str]:
     """Return distinct names for the output's images folder, without white space and with a lower-case suffix.
 
-    COLMAP separates names in lists of pairs by white space, and some file systems do not distinguish A.jpg from a.jpg.
-    Images other than JPEG become .png.
+    COLMAP separates names in lists of pairs by white space, and takes a line that begins with # for a comment. Some
+    file systems do not distinguish A.jpg from a.jpg. Images other than JPEG become .png.
 
     Args:
         sources: paths of the images in the input folder.
@@ -71,7 +71,7 @@ def output_names(sources: Iterable[Path]) -> list[str]:
     names = []
     for source in sources:
         ending = source.suffix.lower() if source.suffix.lower() in _JPEG else ".png"
-        stem = re.sub(r"\s", "_", source.with_suffix("").as_posix())
+        stem = re.sub(r"\s|^#", "_", source.with_suffix("").as_posix())
         name, count = stem + ending, 1
         while name.lower() in taken:
             count += 1

@@ -95,6 +95,7 @@ def test_digits_that_are_no_numbers_are_letters(tmp_path: Path) -> None:
 def test_names_are_safe_and_different() -> None:
     names = output_names([Path("a b.JPG"), Path("a_b.jpg"), Path("sub dir/x.tif"), Path("A_B.jpg")])
     assert names == ["a_b.jpg", "a_b_2.jpg", "sub_dir/x.png", "A_B_3.jpg"]
+    assert output_names([Path("#1.jpg"), Path("_1.jpg"), Path("a/#1.jpg")]) == ["_1.jpg", "_1_2.jpg", "a/#1.jpg"]
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def walk(folder: Path) -> Iterator[tuple[Path, list[str]]]:
-    """Yield a folder and those below it, each with the sorted names of its files. Never raises.
+    """Yield `folder` and the folders below it, each with the sorted names of its files. Never raises.
 
     Links to folders are followed, since many data sets are linked and not copied. No folder is entered twice, so a
     circle of links ends. Hidden files and folders are skipped.

@@ -23,6 +23,8 @@ PORTS_TRIED = 100
 """Number of ports tried, starting at the requested one."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 """Names of the loopback interface, which other machines cannot reach."""
+EVERYWHERE = ("0.0.0.0", "::")
+"""Hosts that stand for all interfaces of this machine."""
 
 
 def check_installed() -> None:
@@ -76,9 +78,15 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     bound = server.get_port()
     if bound != port:
         say(f"port {port} is taken")
-    shown = f"[{host}]" if ":" in host else host
-    say(f"viewer: http://{shown}:{bound}")
+    say(f"viewer: {addresses(host, bound)}")
     return server
+
+
+def addresses(host: str, port: int) -> str:
+    """Return the address of a server on `host` at `port`, and the one for other machines if it listens for them."""
+    if host in EVERYWHERE:  # no address that a browser can open on every system
+        return f"http://localhost:{port} (from other machines: http://{socket.gethostname()}:{port})"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def close_server(server: viser.ViserServer) -> None:

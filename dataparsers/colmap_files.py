@@ -79,18 +79,23 @@ def text_names(file: Path) -> dict[int, str]:
 
     Raises:
         OSError: if the file cannot be read.
-        DataError: if an image's second line, which may be empty, is missing.
+        DataError: if a line is no image, or an image's second line, which may be empty, is missing.
     """
     names: dict[int, str] = {}
     rule = "each image has two lines, and the second has its keypoints, or is empty"
     with file.open(encoding="utf-8", errors="surrogateescape", newline="\n") as lines:
-        for line in lines:
+        numbered = enumerate(lines, start=1)
+        for number, line in numbered:
             words = line.strip().split(maxsplit=9)
             if not words or words[0].startswith("#"):
                 continue
-            if len(words) == 10 and words[0].isdecimal():
-                names[int(words[0])] = words[9]
-            second = next(lines, None)
+            if len(words) < 10 or not words[0].isdecimal() or not all(map(_is_number, words[:9])):
+                raise DataError(
+                    f"{file}: line {number} is damaged: an image has a number, 4 numbers of a rotation, 3 of a "
+                    "translation, the number of a camera and a name, with decimal points; export the model again"
+                )
+            names[int(words[0])] = words[9]
+            _, second = next(numbered, (0, None))
             if second is None:
                 raise DataError(f"{file} ends after the first line of image {words[-1]!r}; {rule}: add a line")
             points = second.split(maxsplit=9)

@@ -25,6 +25,9 @@ def test_what_is_called_otherwise_stands_for_itself(tiny: Path) -> None:
     (tiny / "other.json").write_text("{}")
     with pytest.raises(DataError, match=r"as a transforms\.json: --data .*other\.json nerfstudio$"):
         find_data(tiny / "other.json")
+    (tiny / "scene.ZIP").touch()
+    with pytest.raises(DataError, match="this is an archive; unpack it, and name the folder"):
+        find_data(tiny / "scene.ZIP")
     assert find_data(tiny / "other.json", "nerfstudio") == (tiny / "other.json", "nerfstudio")
 
 

@@ -27,6 +27,8 @@ PARTS = re.compile(
 """Names of files and folders inside a data folder that users may pass instead of the folder itself."""
 MAX_LEVELS = 3
 """Maximum number of levels between such a part and the data folder."""
+ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".xz", ".zst")
+"""Suffixes of archives."""
 MAX_FILES = 5000
 """Maximum number of files examined for advice."""
 MAX_FOLDERS = 100
@@ -112,6 +114,8 @@ def _advice(path: Path, formats: Mapping[str, type[DataParser]]) -> str:
     if os.path.isfile(path):
         if path.suffix.lower() in VIDEO_SUFFIXES:
             return f"a video has no camera poses yet. {_processing('video', path)}"
+        if path.suffix.lower() in ARCHIVES:
+            return "this is an archive; unpack it, and name the folder"
         if path.suffix.lower() == ".json":
             return f"this is a file, not a data folder; to read it as a transforms.json: --data {path} nerfstudio"
         return "this is a file, not a data folder"

@@ -28,6 +28,8 @@ def frame_count(path: Path) -> int:
     Raises:
         DataError: if the file or ffmpeg is missing, or the file is not a readable video.
     """
+    if path.is_dir():
+        raise DataError(f"--data {path} is a folder without a video; name a video, or a folder with one")
     if not path.is_file():
         raise DataError(f"--data {path}: there is no such file")
     if (advice := install_command("video")) is not None:

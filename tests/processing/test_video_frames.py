@@ -130,6 +130,8 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     with pytest.raises(DataError, match="there is no such file"):
         frame_count(tmp_path / "none.mp4")
+    with pytest.raises(DataError, match="is a folder without a video"):
+        frame_count(tmp_path)
     (tmp_path / "damaged.mp4").write_bytes(b"no video")
     with pytest.raises(DataError, match="not a readable video"):
         frame_count(tmp_path / "damaged.mp4")

@@ -135,7 +135,8 @@ def _refuse(server: Any, is_local: bool) -> None:
         live = infra._live_connections[connection.client_id]
         headers = live.request.headers
         if not is_allowed(headers.get("Origin"), headers.get("Host"), is_local):
-            say(f"viewer: refused a connection of the page {headers.get('Origin')!r:.100}")
+            tunnel = f"ssh -L {server.get_port()}:localhost:{server.get_port()} HOST"
+            say(f"viewer: refused the page {headers.get('Origin')!r:.100}, not its own; from elsewhere: {tunnel}")
             await live.close(1008, "only the viewer's own page may connect")
 
     infra._client_connect_cb.insert(0, check)

@@ -143,3 +143,7 @@ def test_the_nearest_thing_is_named(tmp_path: Path) -> None:
     assert nearest_on_disk(tmp_path / "xyz" / "1.jpg") == f"{tmp_path} has no xyz, but photos, sparse"
     (tmp_path / "empty").mkdir()
     assert nearest_on_disk(tmp_path / "empty" / "1.jpg") == f"{tmp_path / 'empty'} is empty"
+    for link, missing in (("photos/3.jpg", "photos/3.jpg"), ("disk", "disk/1.jpg")):
+        (tmp_path / link).symlink_to("/moved/away")
+        expected = f"{tmp_path / link} is a link to /moved/away, which does not exist"
+        assert nearest_on_disk(tmp_path / missing) == expected

@@ -157,10 +157,12 @@ def has_images(folder: Path) -> bool:
 
 
 def nearest_on_disk(path: Path) -> str:
-    """Return words for an error message about a `path` that does not exist: similar names that do."""
+    """Return words for an error message about a `path` that does not exist: similar names that do, or a broken link."""
     parent = path.parent
     while not parent.is_dir() and parent != parent.parent:
         path, parent = parent, parent.parent
+    if path.is_symlink():  # its content was moved, or never fetched
+        return f"{path} is a link to {os.readlink(path)}, which does not exist"
     try:
         there = sorted(islice((entry.name for entry in os.scandir(parent) if entry.name[0] != "."), MAX_FILES))
     except OSError:

@@ -43,7 +43,7 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     """
     if not path.is_file():
         raise DataError(f"the depth image {path} does not exist")
-    stored = _read(path, read_array) if path.suffix == ".npy" else None
+    stored = _read(path, read_array) if path.suffix.lower() == ".npy" else None
     if stored is not None and stored.shape[2:] == (1,):
         stored = stored[..., 0]  # as networks return it
     is_exr = path.suffix.lower() == ".exr"

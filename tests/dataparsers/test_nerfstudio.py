@@ -352,12 +352,13 @@ def test_the_up_direction_that_a_file_states(capture: Path, stated: Any) -> None
     assert not of_the_flag.z_is_up
 
 
-@pytest.mark.parametrize("ending", ["exr", "npy"])
+@pytest.mark.parametrize("ending", ["exr", "NPY"])
 def test_the_unit_of_depth_in_fractions_is_said(capture: Path, capsys: pytest.CaptureFixture[str], ending: str) -> None:
     (capture / "depth").mkdir()
     depth = np.full((HEIGHT, WIDTH), 2.5, np.float32)
     write_exr(capture / "depth" / "000.exr", {"Z": depth})
     np.save(capture / "depth" / "000.npy", depth[..., None])
+    (capture / "depth" / "000.npy").rename(capture / "depth" / "000.NPY")
     edit(capture, lambda c: c["frames"][0].update(depth_file_path=f"depth/000.{ending}"))
     for factor, said in ((0.001, True), (1.0, False)):
         flags = Nerfstudio(eval_interval=0, depth_unit_scale_factor=factor)

@@ -60,7 +60,7 @@ def join_videos(path: Path, parts: Sequence[Path], seconds: Sequence[float]) -> 
     """
     import imageio_ffmpeg  # type: ignore[import-untyped]
 
-    listed = parts[0].with_name("parts.txt")
+    listed = parts[0].absolute().with_name("parts.txt")
     with _whole(path) as temporary:
         lines = [f"file '{part.name}'\nduration {length:.6f}\n" for part, length in zip(parts, seconds, strict=True)]
         listed.write_text("".join(lines), encoding="utf-8")
@@ -75,7 +75,8 @@ def join_videos(path: Path, parts: Sequence[Path], seconds: Sequence[float]) -> 
 def _whole(path: Path) -> Iterator[Path]:
     """Yield a temporary file that takes the place of `path`, when the block has written it and it is on the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    # ffmpeg takes what stands before a colon in a relative path for a protocol.
+    temporary = path.absolute().with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         with _written(path):
             yield temporary

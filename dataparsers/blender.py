@@ -122,7 +122,7 @@ class Blender(DataParser):
 def has_times(file: Path) -> bool:
     """Return whether the first frame of the transforms file `file` has a time. Never raises."""
     try:
-        frames = json.loads(file.read_text(encoding="utf-8")).get("frames")
+        frames = json.loads(file.read_bytes()).get("frames")
         return isinstance(frames, list) and bool(frames) and isinstance(frames[0], dict) and "time" in frames[0]
     except (OSError, ValueError, RecursionError, AttributeError):
         return False

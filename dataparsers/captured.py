@@ -60,7 +60,7 @@ def captured_scene(
     """
     _check_flags(flags)
     originals = images.paths
-    images, reduction = _choose_files(images, flags.downscale_factor)
+    images, reduction = _choose_files(images, flags.downscale_factor, quiet=split != "train")
     if split == "train" and images.taken is None and images.paths != originals:
         files = [one if one.is_file() else other for one, other in zip(originals, images.paths, strict=True)]
         images = replace(images, taken=read_taken(files))  # reduced copies often have no EXIF
@@ -152,14 +152,22 @@ def _check_flags(flags: Captured) -> None:
         raise DataError(f"--near {flags.near} and --far {flags.far}: near must be at least 0 and less than far")
 
 
-def _choose_files(images: PosedImages, factor: int | None) -> tuple[PosedImages, int]:
-    """Return the images with the files to read, and their reduction factor when loading."""
+def _choose_files(images: PosedImages, factor: int | None, quiet: bool) -> tuple[PosedImages, int]:
+    """Return the images with the files to read, and their reduction factor when loading.
+
+    A folder of reduced images that lacks some, as after a stopped command, is not used, and reported unless `quiet`.
+    """
     folder, paths = images.folder, images.paths
     root = _shared_folder(folder, paths)
     steps = sorted({*REDUCED, factor or 1})
-    available = [step for step in steps if any(_reduced(path, root, step).is_file() for path in paths)]
-    if not available:
+    counts = {step: sum(_reduced(path, root, step).is_file() for path in paths) for step in steps}
+    most = max(counts.values())
+    if most == 0:
         return images, 1  # `existing_files` reports it
+    available = [step for step in steps if counts[step] == most or (step == 1 and counts[step])]
+    partial = [str(step) for step in steps if counts[step] and step not in available]
+    if partial and not quiet:
+        say(f"{root}: not all images have one reduced by {' and '.join(partial)} beside them; these are not used")
     if factor is None:
         factor = available[0]
         files = [_reduced(path, root, factor) for path in paths]
@@ -298,9 +306,12 @@ def _check_intrinsics(images: PosedImages, sizes: Tensor) -> None:
         # Rounding to whole pixels changes the aspect ratio of small images more.
         slack = ASPECT_TOLERANCE + 1 / min(actual)
         if abs(math.log(actual[0] * stated[1] / (actual[1] * stated[0]))) > slack:
+            remedy = "it was cropped or rotated; restore it, or remove it from the data"
+            if abs(math.log(actual[0] * stated[0] / (actual[1] * stated[1]))) <= slack:
+                # The camera's program obeys EXIF, which COLMAP and others ignore.
+                remedy = "it is stored on its side; turn such images as EXIF says: mogrify -auto-orient IMAGES"
             raise DataError(
-                f"{path} is {actual[0]}x{actual[1]} pixels, but its camera is for "
-                f"{stated[0]}x{stated[1]}: it was cropped or rotated; restore it, or remove it from the data"
+                f"{path} is {actual[0]}x{actual[1]} pixels, but its camera is for {stated[0]}x{stated[1]}: {remedy}"
             )
     lens, expected = images.lens, len(LENSES[images.model])
     if lens is not None and (lens.shape[1] != expected or not bool(lens.isfinite().all())):

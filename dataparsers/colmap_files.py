@@ -6,6 +6,7 @@ reads without end. So each file is traversed once, record by record, before it i
 
 from __future__ import annotations
 
+import codecs
 import mmap
 import struct
 from collections.abc import Callable
@@ -38,6 +39,23 @@ def check_binary(folder: Path) -> None:
             _check_file(folder / f"{name}.bin", walk, records)
 
 
+def check_text(folder: Path) -> None:
+    """Check that the existing text files of a model in `folder` begin as COLMAP expects.
+
+    Raises:
+        OSError: if a file cannot be read.
+        DataError: if a file begins with a byte-order mark, as some editors write it.
+    """
+    for file in (folder / f"{name}.txt" for name in RECORDS):
+        if not file.is_file():
+            continue
+        with file.open("rb") as opened:
+            if opened.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8:
+                raise DataError(
+                    f"{file} begins with a byte-order mark, which COLMAP does not read; save it without one"
+                )
+
+
 def image_names(folder: Path) -> list[str]:
     """Return the readable names of the images in the model in `folder`. Never raises."""
     names: list[str] = []
@@ -61,22 +79,28 @@ def text_names(file: Path) -> dict[int, str]:
 
     Raises:
         OSError: if the file cannot be read.
-        DataError: if an image's second line, which may be empty, is missing.
+        DataError: if a line is no image, or an image's second line, which may be empty, is missing.
     """
     names: dict[int, str] = {}
+    rule = "each image has two lines, and the second has its keypoints, or is empty"
     with file.open(encoding="utf-8", errors="surrogateescape", newline="\n") as lines:
-        for line in lines:
+        numbered = enumerate(lines, start=1)
+        for number, line in numbered:
             words = line.strip().split(maxsplit=9)
             if not words or words[0].startswith("#"):
                 continue
-            if len(words) == 10 and words[0].isdecimal():
-                names[int(words[0])] = words[9]
-            points = next(lines, "").split(maxsplit=9)
-            if len(points) == 10 and points[0].isdecimal() and not _is_number(points[9].split()[-1]):
+            if len(words) < 10 or not words[0].isdecimal() or not all(map(_is_number, words[:9])):
                 raise DataError(
-                    f"{file}: the line after image {words[-1]!r} is another image; each image has two lines, and the "
-                    "second has its keypoints, or is empty"
+                    f"{file}: line {number} is damaged: an image has a number, 4 numbers of a rotation, 3 of a "
+                    "translation, the number of a camera and a name, with decimal points; export the model again"
                 )
+            names[int(words[0])] = words[9]
+            _, second = next(numbered, (0, None))
+            if second is None:
+                raise DataError(f"{file} ends after the first line of image {words[-1]!r}; {rule}: add a line")
+            points = second.split(maxsplit=9)
+            if len(points) == 10 and points[0].isdecimal() and not _is_number(points[9].split()[-1]):
+                raise DataError(f"{file}: the line after image {words[-1]!r} is another image; {rule}")
     return names
 
 

@@ -19,7 +19,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import one_line
 from nerfloom.cameras.cameras import check_pose
 from nerfloom.data.names_on_disk import match_names
-from nerfloom.dataparsers.colmap_files import check_binary, image_names, text_names
+from nerfloom.dataparsers.colmap_files import check_binary, check_text, image_names, text_names
 from nerfloom.dataparsers.reading import file_name
 from nerfloom.dataparsers.rotations import rotations, unit_quaternions
 
@@ -135,13 +135,18 @@ def read_model(folder: Path) -> SparseModel:
     """
     complete = {kind: all((folder / f"{name}.{kind}").is_file() for name in FILES) for kind in ("bin", "txt")}
     if not any(complete.values()):
-        raise DataError(f"{folder} is not a complete COLMAP model: it needs {', '.join(FILES)}, all .bin or all .txt")
+        raise DataError(
+            f"{folder} is not a complete COLMAP model: it needs {', '.join(FILES)}, all .bin or all .txt; export it "
+            "again, or, if a text model has no points, add an empty points3D.txt"
+        )
     check_binary(folder)
     try:
         import pycolmap
     except ImportError as error:
         raise DataError(f"reading {folder} needs pycolmap, which is not installed: pip install pycolmap") from error
     try:
+        if not complete["bin"]:
+            check_text(folder)
         # In text files, pycolmap ends a name at its first space.
         known = {} if complete["bin"] else text_names(folder / "images.txt")
         model = pycolmap.Reconstruction(str(folder))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nerfloom.base.console import say
-from nerfloom.data.names_on_disk import REDUCED, files_below, reduced_folder, spelled, without_ending
+from nerfloom.data.names_on_disk import REDUCED, companions_of, files_below, reduced_folder
 
 
 def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | None:
@@ -22,11 +22,7 @@ def find_masks(root: Path, names: Sequence[str]) -> tuple[Path | None, ...] | No
         Files in `root`, even if only reduced ones exist; None for an image without mask.
     """
     available = sorted({file for factor in REDUCED for file in files_below(reduced_folder(root, factor))})
-    found = {key: file for file in available for key in (without_ending(file), spelled(file))}
-    masks = []
-    for name in names:
-        candidates = (spelled(name), without_ending(name))
-        masks.append(next((root / found[candidate] for candidate in candidates if candidate in found), None))
+    masks = [None if file is None else root / file for file in companions_of(names, available)]
     without = [name for name, mask in zip(names, masks, strict=True) if mask is None]
     if len(without) == len(masks):
         if available:

@@ -70,8 +70,8 @@ class Nerfstudio(Captured):
         file = path if path.suffix == ".json" else path / TRANSFORMS
         content = read_object(file)
         images = _posed_images(file, content, split)
-        if split == "train" and self.depth_unit_scale_factor == MILLIMETRE and _has_exr(images.depths):
-            say("depths in EXR files are read as millimetres; use --depth-unit-scale-factor 1 if they are in metres")
+        if split == "train" and self.depth_unit_scale_factor == MILLIMETRE and _may_be_metres(images.depths):
+            say("depths are read as millimetres; use --depth-unit-scale-factor 1 if they are in metres")
         lists = {} if self.eval_mode == "all" else _lists(file, content, images.names)
         stated = self._stated_orientation(content)
         flags = self if stated is None else replace(self, orientation_method=stated)
@@ -139,8 +139,9 @@ def _taken(content: dict[str, Any], frames: Frames) -> tuple[Taken, ...] | None:
     return tuple(taken)
 
 
-def _has_exr(depths: tuple[Path | None, ...] | None) -> bool:
-    return any(path is not None and path.suffix.lower() == ".exr" for path in depths or ())
+def _may_be_metres(depths: tuple[Path | None, ...] | None) -> bool:
+    """Return whether a file of `depths` may hold fractions, so that its unit is not known to be small."""
+    return any(path is not None and path.suffix.lower() in (".exr", ".npy") for path in depths or ())
 
 
 def _points(file: Path, content: dict[str, Any], split: Split) -> Tensor | None:

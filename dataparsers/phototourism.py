@@ -84,7 +84,7 @@ def read_splits(file: Path) -> dict[str, str]:
         DataError: if the file cannot be read, lacks a column, or has an unknown split.
     """
     try:
-        with file.open(encoding="utf-8", newline="") as handle:
+        with file.open(encoding="utf-8-sig", newline="") as handle:
             rows = list(csv.DictReader(handle, delimiter="\t"))
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror}") from error

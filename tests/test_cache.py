@@ -297,3 +297,11 @@ def test_without_a_limit_half_of_the_memory_is(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.delenv("NERFLOOM_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert PixelMemory.of().folder == tmp_path / "nerfloom"
+
+
+def test_a_user_without_a_home_is_told_how_to_name_a_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("NERFLOOM_CACHE", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 4_000_000_001, raising=False)  # no user's number
+    with pytest.raises(ConfigError, match="no home folder: set the variable NERFLOOM_CACHE"):
+        PixelMemory.of()

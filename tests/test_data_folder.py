@@ -25,6 +25,9 @@ def test_what_is_called_otherwise_stands_for_itself(tiny: Path) -> None:
     (tiny / "other.json").write_text("{}")
     with pytest.raises(DataError, match=r"as a transforms\.json: --data .*other\.json nerfstudio$"):
         find_data(tiny / "other.json")
+    (tiny / "scene.ZIP").touch()
+    with pytest.raises(DataError, match="this is an archive; unpack it, and name the folder"):
+        find_data(tiny / "scene.ZIP")
     assert find_data(tiny / "other.json", "nerfstudio") == (tiny / "other.json", "nerfstudio")
 
 
@@ -46,6 +49,30 @@ def test_photographs_and_videos_get_a_command_to_paste(tiny: Path, tmp_path: Pat
     video = ["ns-process-data", "video", "--data", str(clip), "--output-dir", str(clip.with_name("walk-processed"))]
     assert advised(clip) == advised(clip.parent) == video
     assert all(f"  {kind} " in USAGE for kind in ("images", "video"))
+
+
+def test_what_a_folder_looks_like_is_said_if_it_is_called_otherwise(
+    shared_tiny: Path, tiny: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Recipes of other programs name their formats, which many a capture is not in."""
+    assert find_data(shared_tiny, "nerfstudio") == (shared_tiny, "nerfstudio")
+    assert "looks like blender, not nerfstudio; to read it as such, leave out nerfstudio" in capsys.readouterr().err
+    assert find_data(shared_tiny, "blender") == (shared_tiny, "blender")
+    assert find_data(tiny / "train", "blender") == (tiny, "blender")
+    assert not capsys.readouterr().err
+
+
+def test_a_folder_around_the_data_is_told_where_they_are(shared_tiny: Path, tmp_path: Path) -> None:
+    """Many archives have a folder of the same name inside, and many people keep their data sets together."""
+    (tmp_path / "my scenes").mkdir()
+    (tmp_path / "my scenes" / "a").symlink_to(shared_tiny)
+    with pytest.raises(DataError) as error:
+        find_data(tmp_path)
+    place = shlex.split(str(error.value).partition("the data is in a folder inside: --data ")[2])
+    assert place == [str(tmp_path / "my scenes" / "a")]
+    shutil.copytree(shared_tiny, tmp_path / "my scenes" / "b")
+    with pytest.raises(DataError, match="1 more folders have data"):
+        find_data(tmp_path)
 
 
 def test_the_output_has_a_name_even_for_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

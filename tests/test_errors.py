@@ -1,11 +1,12 @@
 """Errors: one short printable line, for all names and values in it."""
 
 import pickle
+import string
 
 import pytest
 
 from nerfloom.base.console import say
-from nerfloom.base.errors import MAX_MESSAGE_LENGTH, DataError, printable, shown
+from nerfloom.base.errors import MAX_MESSAGE_LENGTH, DataError, nearest, printable, shown
 
 
 @pytest.mark.parametrize(
@@ -28,6 +29,13 @@ def test_names_of_files_can_neither_break_the_line_nor_command_the_terminal(
 
 def test_a_message_is_never_longer_than_a_screen() -> None:
     assert len(str(DataError("a" * 10**6))) == MAX_MESSAGE_LENGTH + 3
+
+
+def test_a_hint_lists_few_names_or_the_nearest() -> None:
+    many = [f"setting_{letter}" for letter in string.ascii_lowercase * 2]
+    assert nearest("xyz", many[:3]) == "Known: setting_a, setting_b, setting_c."
+    assert nearest("xyz", many) == "None of the 52 known names is similar."
+    assert nearest("seting_q", many).startswith("Did you mean 'setting_q'")
 
 
 def test_errors_pass_between_processes() -> None:

@@ -7,6 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from nerfloom.base.errors import DataError
 from nerfloom.data.dataset import Dataset, load_dataset
@@ -74,6 +75,20 @@ def test_grey_is_split_in_the_middle_and_colour_modes_do_not_matter(tmp_path: Pa
     iio.imwrite(tmp_path / "rgb.png", np.repeat(grey[..., None], 3, -1))
     for name in ("grey.png", "rgb.png"):
         assert read_mask(tmp_path / name, 4, 1).tolist() == [[False, False, True, True]]
+
+
+def test_masks_as_programs_of_segmentation_write_them(tmp_path: Path) -> None:
+    used = np.random.default_rng(0).random((6, 5)) < 0.5
+    white = np.full((6, 5), 255, np.uint8)
+    grey = np.where(used, 255, 0).astype(np.uint8)
+    Image.fromarray(used.astype(np.uint8)).save(tmp_path / "labels.png")  # 0 and 1
+    Image.fromarray(np.dstack([white, white, white, grey])).save(tmp_path / "cutout.png")  # white, or transparent
+    Image.fromarray(grey).convert("LA").save(tmp_path / "opaque.png")
+    Image.fromarray(used).save(tmp_path / "bits.png")
+    for name in ("labels.png", "cutout.png", "opaque.png", "bits.png"):
+        assert np.array_equal(read_mask(tmp_path / name, 5, 6), used), name
+    Image.fromarray(0 * grey).save(tmp_path / "black.png")
+    assert not read_mask(tmp_path / "black.png", 5, 6).any()
 
 
 @pytest.mark.parametrize("factor", [2, 3])

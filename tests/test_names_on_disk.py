@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfloom.data.names_on_disk import files_below, match_names, nearest_on_disk, on_disk
+from nerfloom.data.names_on_disk import distinct_names, files_below, match_names, nearest_on_disk, on_disk
 
 
 def make(folder: Path, *files: str) -> Path:
@@ -60,6 +60,24 @@ def test_what_is_there_is_taken_without_a_word(tmp_path: Path, capsys: pytest.Ca
     expected = "images/c.jpg" if "c" in name else {"a": "photos/a.jpg", "b": "photos/b.JPG"}[Path(name).stem]
     assert path == tmp_path / expected
     assert ("ending" in capsys.readouterr().err) == (name == "images/c")
+
+
+def test_names_have_the_folders_that_distinguish_files() -> None:
+    scene = Path("/data/scene")
+    assert distinct_names([scene / "1.jpg", scene / "2.jpg", scene / "1.jpg"]) == ("1.jpg", "2.jpg", "1.jpg")
+    rig = [scene / side / day / name for side in "lr" for day in ("mon", "tue") for name in ("1.jpg", "2.jpg")]
+    assert distinct_names(rig) == tuple(path.relative_to(scene).as_posix() for path in rig)
+    assert distinct_names(rig[:4]) == ("mon/1.jpg", "mon/2.jpg", "tue/1.jpg", "tue/2.jpg")
+    assert distinct_names([]) == ()
+
+
+def test_files_in_a_linked_folder_are_found(tmp_path: Path) -> None:
+    make(tmp_path / "disk", "a.JPG")
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "scan" / "photos").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "circle").symlink_to(tmp_path / "scan")
+    assert on_disk(tmp_path / "scan", ["photos/a.jpg"]) == (tmp_path / "scan" / "photos" / "a.JPG",)
+    assert on_disk(tmp_path / "scan", ["images/a.jpg"]) == (tmp_path / "scan" / "photos" / "a.JPG",)
 
 
 def test_absolute_names_that_exist_are_kept(tmp_path: Path) -> None:
@@ -125,3 +143,7 @@ def test_the_nearest_thing_is_named(tmp_path: Path) -> None:
     assert nearest_on_disk(tmp_path / "xyz" / "1.jpg") == f"{tmp_path} has no xyz, but photos, sparse"
     (tmp_path / "empty").mkdir()
     assert nearest_on_disk(tmp_path / "empty" / "1.jpg") == f"{tmp_path / 'empty'} is empty"
+    for link, missing in (("photos/3.jpg", "photos/3.jpg"), ("disk", "disk/1.jpg")):
+        (tmp_path / link).symlink_to("/moved/away")
+        expected = f"{tmp_path / link} is a link to /moved/away, which does not exist"
+        assert nearest_on_disk(tmp_path / missing) == expected

@@ -9,6 +9,8 @@ from typing import Any
 
 MAX_MESSAGE_LENGTH = 2000
 """Maximum number of characters of an error message. Text quoted from a damaged file may be longer than a screen."""
+MAX_LISTED = 40
+"""Maximum number of names that a hint lists."""
 
 
 class NerfloomError(ValueError):
@@ -60,7 +62,7 @@ def one_line(error: BaseException) -> str:
 
 
 def nearest(name: str, candidates: Iterable[str]) -> str:
-    """Return a hint that names the candidates closest to a misspelt name, or lists all of them.
+    """Return a hint that names the candidates closest to a misspelt name, or lists all of them if they are few.
 
     Args:
         name: the misspelt name.
@@ -73,6 +75,8 @@ def nearest(name: str, candidates: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, candidates, n=3, cutoff=0.5)
     if close:
         return "Did you mean " + " or ".join(repr(match) for match in close) + "?"
+    if len(candidates) > MAX_LISTED:
+        return f"None of the {len(candidates):,} known names is similar."
     return "Known: " + ", ".join(candidates) + "."
 
 

@@ -12,13 +12,13 @@ from nerfloom.base.errors import DataError, shown
 
 
 def read_json(file: Path) -> Any:
-    """Read the content of the JSON `file`.
+    """Read the content of the JSON `file`, in UTF-8, or in UTF-16 or UTF-32, which programs of Windows write.
 
     Raises:
         DataError: if the file cannot be read, or is not JSON.
     """
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(file.read_bytes())
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

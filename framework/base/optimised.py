@@ -77,7 +77,7 @@ class DefersGradient(Protocol, metaclass=SeesRegistered):
     table: nn.Parameter
     """(E, F) the table."""
     deferred: Any
-    """The deferred gradient (`TableGradient`, `PlanesGradient` or `RowGradient`); None if autograd accumulates it."""
+    """The `DeferredGradient` (kernels/adam/deferred.py); None if autograd accumulates it."""
 
 
 def parameter_groups(model: nn.Module) -> list[ParameterGroup]:

@@ -38,17 +38,13 @@ def signal_of(stop: KeyboardInterrupt) -> int:
 
 @contextmanager
 def orderly_end() -> Iterator[None]:
-    """Make SIGTERM raise `Stopped` within a `with` block, so that child processes and unfinished files are removed.
-
-    Only the main thread receives signals; in other threads this does nothing.
-    """
+    """Make SIGTERM raise `Stopped` within a `with` block, so that child processes and unfinished files are removed."""
 
     def end(number: int, frame: FrameType | None) -> None:
         raise Stopped(number)
 
     # Keep SIGTERM ignored if the parent process ignores it.
-    main = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) != signal.SIG_IGN
-    with handled((signal.SIGTERM,) if main else (), end):
+    with handled(() if signal.getsignal(signal.SIGTERM) == signal.SIG_IGN else (signal.SIGTERM,), end):
         yield
 
 
@@ -74,7 +70,9 @@ def stop_signals() -> Iterator[list[int]]:
 
 @contextmanager
 def handled(numbers: tuple[int, ...], handler: Handler) -> Iterator[dict[int, Any]]:
-    """Handle signals within a `with` block, in the main thread only.
+    """Handle signals within a `with` block.
+
+    Only the main thread receives signals. In other threads, as of a server or a notebook, this does nothing.
 
     Args:
         numbers: the signals' numbers.
@@ -83,6 +81,8 @@ def handled(numbers: tuple[int, ...], handler: Handler) -> Iterator[dict[int, An
     Yields:
         The previous handlers by signal; they are restored at the end.
     """
+    if threading.current_thread() is not threading.main_thread():
+        numbers = ()
     before: dict[int, Any] = {number: signal.getsignal(number) for number in numbers}
     try:
         for number in numbers:

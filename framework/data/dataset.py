@@ -26,7 +26,7 @@ from nerfloom.data.diffuse_light import read_diffuse
 from nerfloom.data.exposure import devices_of, exposures_of, read_taken
 from nerfloom.data.light_spread import APPEARANCE_STOPS, light_spread
 from nerfloom.data.motion_bound import MotionBound
-from nerfloom.data.names_on_disk import nearest_on_disk
+from nerfloom.data.names_on_disk import distinct_names, nearest_on_disk
 from nerfloom.data.normals import read_normals
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.cache import PixelMemory
@@ -94,8 +94,8 @@ class Dataset:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """M file names, without directory."""
-        return tuple(path.name for path in self.paths)
+        """M file names, with as many folders as distinguish all files."""
+        return distinct_names(self.paths)
 
     @property
     def placement(self) -> Placement:

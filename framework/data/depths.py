@@ -43,7 +43,9 @@ def read_depth(path: Path, width: int, height: int) -> np.ndarray:
     """
     if not path.is_file():
         raise DataError(f"the depth image {path} does not exist")
-    stored = _read(path, read_array) if path.suffix == ".npy" else None
+    stored = _read(path, read_array) if path.suffix.lower() == ".npy" else None
+    if stored is not None and stored.shape[2:] == (1,):
+        stored = stored[..., 0]  # as networks return it
     is_exr = path.suffix.lower() == ".exr"
     shape = _read(path, _exr_shape if is_exr else _shape) if stored is None else stored.shape
     if len(shape) != 2 or 0 in shape:

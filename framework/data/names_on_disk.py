@@ -19,6 +19,7 @@ from pathlib import Path, PurePath
 from urllib.parse import unquote
 
 from nerfloom.base.console import say
+from nerfloom.data.folders import walk
 from nerfloom.data.suffixes import IMAGE_SUFFIXES
 
 LIKELIEST = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp")
@@ -121,10 +122,9 @@ def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[s
         endings: endings of the files, in lower case.
     """
     found: set[str] = set()
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        inside = Path(place).relative_to(folder)
-        suited = [name for name in names if not name.startswith(".") and name.lower().endswith(tuple(endings))]
+    for place, names in walk(folder):
+        inside = place.relative_to(folder)
+        suited = [name for name in names if name.lower().endswith(tuple(endings))]
         found |= {(inside / name).as_posix() for name in suited}
         if inside.parts and (base := _full_size(inside.parts[0])):
             found |= {Path(base, *inside.parts[1:], name).as_posix() for name in suited}
@@ -138,16 +138,31 @@ def reduced_folder(folder: Path, factor: int) -> Path:
     return folder if factor == 1 else folder.with_name(f"{folder.name}_{factor}")
 
 
+def distinct_names(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Return the ends of `paths` with the fewest parts that distinguish all files, such as left/1.jpg and right/1.jpg.
+
+    Cameras of a rig often have images of the same names in folders of their own.
+    """
+    names: tuple[str, ...] = ()
+    for count in range(1, max((len(path.parts) for path in paths), default=0) + 1):
+        names = tuple("/".join(path.parts[-count:]) for path in paths)
+        if len(set(names)) == len(set(paths)):
+            break
+    return names
+
+
 def has_images(folder: Path) -> bool:
     """Return whether a quick look finds an image in or below `folder`. Never raises."""
-    return any(_is_image(name) for _, _, names in islice(os.walk(folder), MAX_FOLDERS) for name in names)
+    return any(_is_image(name) for _, names in islice(walk(folder), MAX_FOLDERS) for name in names)
 
 
 def nearest_on_disk(path: Path) -> str:
-    """Return words for an error message about a `path` that does not exist: similar names that do."""
+    """Return words for an error message about a `path` that does not exist: similar names that do, or a broken link."""
     parent = path.parent
     while not parent.is_dir() and parent != parent.parent:
         path, parent = parent, parent.parent
+    if path.is_symlink():  # its content was moved, or never fetched
+        return f"{path} is a link to {os.readlink(path)}, which does not exist"
     try:
         there = sorted(islice((entry.name for entry in os.scandir(parent) if entry.name[0] != "."), MAX_FILES))
     except OSError:
@@ -191,6 +206,20 @@ def without_ending(name: str) -> str:
     path = spelled(name)
     stem, dot, ending = path.rpartition(".")
     return stem if dot + ending in IMAGE_SUFFIXES else path
+
+
+def companions_of(names: Sequence[str], files: Iterable[str]) -> tuple[str | None, ...]:
+    """Return the file that accompanies each name: of its spelling (`spelled`), with an additional or another ending.
+
+    Args:
+        names: M names of images.
+        files: names of the files, relative to a folder that corresponds to that of the images.
+
+    Returns:
+        M of the `files`; None for a name without one.
+    """
+    found = {key: file for file in files for key in (without_ending(file), spelled(file))}
+    return tuple(found.get(spelled(name), found.get(without_ending(name))) for name in names)
 
 
 SPELLINGS: tuple[tuple[str, Callable[[str], str]], ...] = (

@@ -16,9 +16,10 @@ from nerfloom.base.errors import ConfigError
 from nerfloom.evaluation.frames import write_file
 from nerfloom.evaluation.video_suffixes import VIDEO
 
-PRESET, QUALITY = "faster", 17
-"""Preset and constant rate factor of H.264. For 20 frames of a cup, error and size are those of the default preset with
-18, which is considered visually lossless, within 0.1 dB and 5 %; encoding takes about half of the time."""
+PRESET, QUALITY = "superfast", 19
+"""Preset and constant rate factor of H.264. For 45 frames of a cup, 1920 x 1080, the error is 0.3 dB below that of the
+default preset with 18, which is considered visually lossless. Files are 40 % larger; encoding takes a quarter of the
+time."""
 JPEG_QUALITY = 95
 """Quality of JPEG images, 1 to 95."""
 GIF_UNIT = 10
@@ -59,7 +60,7 @@ def join_videos(path: Path, parts: Sequence[Path], seconds: Sequence[float]) -> 
     """
     import imageio_ffmpeg  # type: ignore[import-untyped]
 
-    listed = parts[0].with_name("parts.txt")
+    listed = parts[0].absolute().with_name("parts.txt")
     with _whole(path) as temporary:
         lines = [f"file '{part.name}'\nduration {length:.6f}\n" for part, length in zip(parts, seconds, strict=True)]
         listed.write_text("".join(lines), encoding="utf-8")
@@ -74,7 +75,8 @@ def join_videos(path: Path, parts: Sequence[Path], seconds: Sequence[float]) -> 
 def _whole(path: Path) -> Iterator[Path]:
     """Yield a temporary file that takes the place of `path`, when the block has written it and it is on the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    # ffmpeg takes what stands before a colon in a relative path for a protocol.
+    temporary = path.absolute().with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         with _written(path):
             yield temporary

@@ -56,27 +56,26 @@ def table(*shape: int, like: Tensor | None = None) -> Tensor:
         ConfigError: if the machine has less memory.
     """
     require(4.0 * math.prod(shape), "a table")
-    if like is None:
-        out = torch.empty(shape)
-    else:
-        out = torch.empty(shape, dtype=like.dtype, device=like.device)
-    advise = _madvise()
-    size = out.numel() * out.element_size()
-    if advise is not None and out.device.type == "cpu" and size >= 2 * HUGE_PAGE:
-        first = -(-out.data_ptr() // HUGE_PAGE) * HUGE_PAGE
-        last = (out.data_ptr() + size) // HUGE_PAGE * HUGE_PAGE
-        advise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _MADV_HUGEPAGE)  # a hint: failing is harmless
+    out = torch.empty(shape) if like is None else torch.empty(shape, dtype=like.dtype, device=like.device)
+    if out.numel() * out.element_size() >= 2 * HUGE_PAGE:
+        _advise(out, HUGE_PAGE, _MADV_HUGEPAGE)
     return out.zero_()
 
 
 def page_out(values: Tensor) -> None:
     """Let the system take back the memory of `values` if it is also in a file. The values stay as they are."""
-    advise, size = _madvise(), values.numel() * values.element_size()
-    if advise is not None and values.device.type == "cpu" and values.is_contiguous():
-        first = -(-values.data_ptr() // mmap.PAGESIZE) * mmap.PAGESIZE
-        last = (values.data_ptr() + size) // mmap.PAGESIZE * mmap.PAGESIZE
+    if values.is_contiguous():
+        _advise(values, mmap.PAGESIZE, _MADV_PAGEOUT)
+
+
+def _advise(values: Tensor, page: int, advice: int) -> None:
+    """Advise the system about the whole pages of contiguous `values`, where it can be advised."""
+    advise = _madvise()
+    if advise is not None and values.device.type == "cpu":
+        first = -(-values.data_ptr() // page) * page
+        last = (values.data_ptr() + values.numel() * values.element_size()) // page * page
         if last > first:
-            advise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), _MADV_PAGEOUT)  # a hint: failing is harmless
+            advise(ctypes.c_void_p(first), ctypes.c_size_t(last - first), advice)  # a hint: failing is harmless
 
 
 class Tables:

@@ -1,4 +1,4 @@
-"""Launch of kernels, and shared functions: optical depth, and an exponential without cancellation.
+"""Launch of kernels, and functions they share: rows of a program, optical depth, opacity without cancellation.
 
 Sizes are passed as numbers, not as constants of the kernel, and Triton is told not to specialise on their values. So a
 kernel is compiled once for all numbers of rays or samples. Constants are a method's sizes, such as the number of
@@ -52,6 +52,28 @@ def on_device(value: float | Tensor, like: Tensor) -> Tensor:
 def blocks(count: int, size: int) -> int:
     """Return the number of blocks of `size` items that hold `count` items."""
     return -(-count // size)
+
+
+@triton.jit
+def own_rows(count, BLOCK: tl.constexpr):
+    """Return the numbers, int64, of the `BLOCK` rows that this program processes, and whether each is below `count`."""
+    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    return n, n < count
+
+
+@triton.jit
+def load_three(row, here):
+    """Return the values at the addresses `row` and the two after each, 0 where not `here`."""
+    x, y = tl.load(row, mask=here, other=0.0), tl.load(row + 1, mask=here, other=0.0)
+    return x, y, tl.load(row + 2, mask=here, other=0.0)
+
+
+@triton.jit
+def store_three(row, x, y, z, here):
+    """Write `x`, `y` and `z` to the addresses `row` and the two after each, where `here`."""
+    tl.store(row, x, mask=here)
+    tl.store(row + 1, y, mask=here)
+    tl.store(row + 2, z, mask=here)
 
 
 @triton.jit

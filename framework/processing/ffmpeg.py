@@ -28,6 +28,8 @@ def frame_count(path: Path) -> int:
     Raises:
         DataError: if the file or ffmpeg is missing, or the file is not a readable video.
     """
+    if path.is_dir():
+        raise DataError(f"--data {path} is a folder without a video; name a video, or a folder with one")
     if not path.is_file():
         raise DataError(f"--data {path}: there is no such file")
     if (advice := install_command("video")) is not None:
@@ -35,7 +37,7 @@ def frame_count(path: Path) -> int:
     import imageio_ffmpeg  # type: ignore[import-untyped]
 
     try:
-        count, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+        count, _ = imageio_ffmpeg.count_frames_and_secs(_named(path))
     except Exception as error:  # any type, from ffmpeg or its wrapper
         raise DataError(f"--data {path} is not a readable video; play it to check that it is complete") from error
     return max(int(count), 1)
@@ -61,7 +63,7 @@ def survey(path: Path, look: Callable[[np.ndarray], R]) -> tuple[np.ndarray, lis
         graph = f"[0:v:0]{_GREY},split[seen][timed]"
         kept = [*_passthrough(), "-map", "[seen]", "-c:v", "pgm", "-f", "image2pipe", "pipe:1"]
         timed = [*_passthrough(), "-map", "[timed]", "-f", "framecrc", str(listed)]
-        arguments = ["-i", str(path), "-filter_complex", graph, *kept, *timed]
+        arguments = ["-i", _named(path), "-filter_complex", graph, *kept, *timed]
         frames = track(_pictures(path, arguments), "Looking at the video", total=frame_count(path))
         results = [look(frame[..., 0]) for frame in frames]
         times = _times(listed)[: len(results)] if results else np.zeros(0)
@@ -72,7 +74,7 @@ def survey(path: Path, look: Callable[[np.ndarray], R]) -> tuple[np.ndarray, lis
 
 def chosen_frames(path: Path, numbers: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the frames `numbers` (K,), ascending from 0, of the video `path` as (H, W, 3) uint8, upright."""
-    arguments = ["-i", str(path), "-map", "0:v:0", *_passthrough(), "-c:v", "ppm", "-pix_fmt", "rgb24"]
+    arguments = ["-i", _named(path), "-map", "0:v:0", *_passthrough(), "-c:v", "ppm", "-pix_fmt", "rgb24"]
     wanted = iter(track(numbers.tolist(), "Reading the frames", total=len(numbers)))
     number = next(wanted, None)
     with closing(_pictures(path, [*arguments, "-f", "image2pipe", "pipe:1"])) as frames:
@@ -82,6 +84,11 @@ def chosen_frames(path: Path, numbers: np.ndarray) -> Iterator[np.ndarray]:
                 number = next(wanted, None)
             if number is None:
                 return
+
+
+def _named(path: Path) -> str:
+    """Return the name of a file for ffmpeg, which takes what stands before a colon for a protocol."""
+    return str(path.absolute())
 
 
 def _pictures(path: Path, arguments: list[str]) -> Generator[np.ndarray, None, None]:

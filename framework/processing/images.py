@@ -11,12 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
+import numpy as np
 from PIL import Image
 
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError
 from nerfloom.data.image_files import Content, read_heif, unreadable
+from nerfloom.data.masks import read_white
+from nerfloom.data.names_on_disk import companions_of, files_below
 from nerfloom.processing.brightness import eight_bits, tones
+from nerfloom.processing.listing import READABLE
 
 _JPEG = (".jpg", ".jpeg")
 _ORIENTATION = 0x0112
@@ -57,8 +61,8 @@ class PreparedImage:
 def output_names(sources: Iterable[Path]) -> list[str]:
     """Return distinct names for the output's images folder, without white space and with a lower-case suffix.
 
-    COLMAP separates names in lists of pairs by white space, and some file systems do not distinguish A.jpg from a.jpg.
-    Images other than JPEG become .png.
+    COLMAP separates names in lists of pairs by white space, and takes a line that begins with # for a comment. Some
+    file systems do not distinguish A.jpg from a.jpg. Images other than JPEG become .png.
 
     Args:
         sources: paths of the images in the input folder.
@@ -67,7 +71,7 @@ def output_names(sources: Iterable[Path]) -> list[str]:
     names = []
     for source in sources:
         ending = source.suffix.lower() if source.suffix.lower() in _JPEG else ".png"
-        stem = re.sub(r"\s", "_", source.with_suffix("").as_posix())
+        stem = re.sub(r"\s|^#", "_", source.with_suffix("").as_posix())
         name, count = stem + ending, 1
         while name.lower() in taken:
             count += 1
@@ -144,11 +148,9 @@ def prepare(folder: Path, source: Path, images: Path, name: str, upright: bool =
                 exif.pop(_ORIENTATION, None)
                 result = eight_bits(image) if operation is None else eight_bits(image).transpose(operation)
                 result = _cropped(result, crop)
-                options = {"exif": exif.tobytes(), "icc_profile": image.info.get("icc_profile")}
+                options = {"exif": exif.tobytes(), "icc_profile": _profile(image)}
                 save(result, target, {key: value for key, value in options.items() if value})
                 size = result.size
-    except DataError:
-        raise
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):  # a full disk is not the image's fault
             raise
@@ -170,7 +172,7 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path) -> dic
     """Write the masks of prepared images as 0 or 255, upright like them, named as in COLMAP: image.jpg.png.
 
     Args:
-        folder: folder of masks named like the images, with their suffix, or with .png instead of it or after it.
+        folder: folder of masks, named like the images, with an additional or another ending.
         prepared: the prepared images.
         masks: folder to write to.
 
@@ -181,31 +183,27 @@ def write_masks(folder: Path, prepared: list[PreparedImage], masks: Path) -> dic
         DataError: if no mask is found, or one differs in size from its image.
     """
     mask_names = {}
-    for entry in prepared:
-        source = PurePosixPath(entry.source)
-        candidates = [source, source.with_suffix(".png"), source.with_suffix(".PNG"), PurePosixPath(f"{source}.png")]
-        path = next((folder / candidate for candidate in candidates if (folder / candidate).is_file()), None)
-        if path is None:
+    files = [file for file in files_below(folder, READABLE) if (folder / file).is_file()]
+    for entry, file in zip(prepared, companions_of([entry.source for entry in prepared], files), strict=True):
+        if file is None:
             continue
-        try:
-            with Image.open(Content(path)) as image:
-                mask = image.convert("L").point(lambda value: 255 if value >= 128 else 0)
-        except Exception as error:
-            raise unreadable(path, error, "the mask") from error
+        mask = Image.fromarray(np.where(read_white(folder / file), 255, 0).astype(np.uint8))
         size = (entry.width, entry.height)
         is_upright = entry.orientation >= 5 and mask.size == size and size[0] != size[1]
         if entry.orientation in OPERATIONS and not is_upright:
             mask = mask.transpose(OPERATIONS[entry.orientation])
         if mask.size != size:
-            raise DataError(f"the mask {path} differs in size from its image {entry.source}")
+            raise DataError(f"the mask {folder / file} differs in size from its image {entry.source}")
         target = masks / f"{entry.name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         mask.save(target)
         mask_names[entry.name] = f"{entry.name}.png"
     if not mask_names:
-        raise DataError(f"--masks-dir {folder} has no mask; the first expected is {candidates[1] if prepared else ''}")
-    if len(mask_names) < len(prepared):
-        say(f"{len(prepared) - len(mask_names)} of {len(prepared)} images have no mask")
+        first = PurePosixPath(prepared[0].source).with_suffix(".png")
+        raise DataError(f"--masks-dir {folder} has no mask; the first expected is {first}")
+    without = [entry.source for entry in prepared if entry.name not in mask_names]
+    if without:
+        say(f"{len(without)} of {len(prepared)} images have no mask, the first {without[0]}")
     return mask_names
 
 
@@ -225,6 +223,15 @@ def _cropped(image: Image.Image, crop: int) -> Image.Image:
     if min(width, height) <= 2 * crop:
         raise DataError(f"an image of {width}x{height} pixels has no pixels left after cropping {crop} at each side")
     return image.crop((crop, crop, width - crop, height - crop))
+
+
+def _profile(image: Image.Image) -> bytes:
+    """Return the colour profile of an image after its conversion to RGB; empty if it has none, or one of other colours.
+
+    Bytes 16 to 19 of a profile name the colours that it describes (ICC.1:2022, 7.2).
+    """
+    profile: bytes = image.info.get("icc_profile") or b""
+    return profile if profile[16:20] == b"RGB " else b""
 
 
 def _is_uniform(image: Image.Image, path: Path, ending: str) -> bool:

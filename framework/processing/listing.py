@@ -11,6 +11,8 @@ from typing import TypeVar
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
 from nerfloom.base.evenly_spaced import evenly_spread
+from nerfloom.data.folders import walk
+from nerfloom.data.names_on_disk import COMPANIONS
 from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
 T = TypeVar("T")
@@ -28,11 +30,17 @@ def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
         leave_out: folders inside it to ignore.
 
     Raises:
-        DataError: if the folder does not exist or has no images.
+        DataError: if there is no such folder, or it has no images.
     """
+    if folder.is_file():
+        raise DataError(f"--data {folder} is a file; name the folder of the images")
     if not folder.is_dir():
         raise DataError(f"--data {folder}: there is no such folder")
     images, others = _split(folder, leave_out)
+    images, companions = _without_companions(images)
+    if companions:
+        where = companions[0].parent.as_posix()
+        say(f"left out: {len(companions)} images in folders such as {where}, whose names say masks or the like")
     if not images:
         raise DataError(f"--data {folder} has no images (looked for {', '.join(READABLE)}){_listed(others)}")
     if others:
@@ -95,13 +103,26 @@ def _split(folder: Path, leave_out: Iterable[Path]) -> tuple[list[Path], list[Pa
     ignored = [path.resolve() for path in leave_out if not folder.resolve().is_relative_to(path.resolve())]
     images: list[Path] = []
     others: list[Path] = []
-    for path in folder.rglob("*"):
-        relative = path.relative_to(folder)
-        if any(part.startswith(".") for part in relative.parts) or not path.is_file():
+    for path in (place / name for place, names in walk(folder) for name in names):
+        # A link to a missing file is listed, so that it is reported.
+        if not path.is_file() and not path.is_symlink():
             continue
         if not any(path.resolve().is_relative_to(entry) for entry in ignored):
-            (images if path.suffix.lower() in READABLE else others).append(relative)
+            (images if path.suffix.lower() in READABLE else others).append(path.relative_to(folder))
     return sorted(images, key=natural_order), sorted(others, key=natural_order)
+
+
+def _without_companions(images: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the photographs, and the images that accompany them, by the names of their folders (`COMPANIONS`).
+
+    If all are in such folders, all are photographs.
+    """
+    photographs: list[Path] = []
+    companions: list[Path] = []
+    for path in images:
+        accompanies = any(part.lower().startswith(COMPANIONS) for part in path.parts[:-1])
+        (companions if accompanies else photographs).append(path)
+    return (photographs, companions) if photographs else (images, [])
 
 
 def _listed(paths: list[Path]) -> str:

@@ -20,6 +20,7 @@ constant (Sloan 2008, with the Condon-Shortley phase). So coefficients are store
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -36,6 +37,7 @@ from nerfloom.kernels.splats.project import DEGREES
 from nerfloom.splats.compressed_ply import is_compressed, read_compressed
 from nerfloom.splats.gaussians import MAX_DEGREE, Gaussians, Splats
 from nerfloom.splats.look import ELSEWHERE, OURS, Look, comments, discs, look_of
+from nerfloom.splats.stored import MIN_DEVIATION
 from nerfloom.splats.stream import GaussianStream
 
 MAX_LOGIT = 16.0
@@ -205,7 +207,7 @@ def _stored(file: Path, vertex: PlyElement) -> Gaussians:
 
     gaussians = Gaussians(
         means=together("xyz", np.float64 if dict(vertex.columns)["x"] == "f8" else np.float32),
-        log_scales=together(_SCALES),
+        log_scales=_finite_sizes(together(_SCALES)),
         rotations=together(_ROTATIONS),
         logits=_finite_logits(together(["opacity"])[:, 0]),
         colors=together(_DC),
@@ -225,6 +227,11 @@ def _together(columns: Sequence[np.ndarray], kind: type = np.float32) -> Tensor:
 
 def _finite_logits(logits: Tensor) -> Tensor:
     return torch.where(logits.isinf(), MAX_LOGIT * logits.sign(), logits)
+
+
+def _finite_sizes(log_scales: Tensor) -> Tensor:
+    """Return log scales with a finite one for the size 0, which other programs write for flat Gaussians."""
+    return log_scales.masked_fill(log_scales == -math.inf, math.log(MIN_DEVIATION))
 
 
 def usable(gaussians: Gaussians, file: Path) -> Gaussians:

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from nerfloom.base.console import say
+from nerfloom.base.console import say, track
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.evenly_spaced import evenly_spaced
 from nerfloom.cameras.cameras import Cameras
@@ -35,6 +35,8 @@ PLACES = {
     "random": "anywhere in the box",
 }
 """Descriptions of the kinds of initial points."""
+PAIRS = 2**24
+"""Number of pairs of a point and a camera, for distances in parts."""
 NEIGHBOURS = 3
 """Number of neighbours; their mean distance is a Gaussian's initial size."""
 
@@ -142,27 +144,41 @@ def seen_colors(points: Tensor, dataset: Dataset, views: int = 2) -> Tensor:
     Args:
         points: (N, 3) scene coordinates.
         dataset: images; transparent pixels do not count.
-        views: number of images per point.
+        views: number of images per point, among the `4 * views` nearest cameras.
     """
     cameras = dataset.cameras
     total, count = points.new_zeros(len(points), 3), points.new_zeros(len(points))
-    centers = cameras.camera_to_worlds[:, :, 3]
-    distance = torch.cdist(points, centers)
-    for index in distance.mean(0).argsort().tolist():
-        columns, rows, shown = cameras.project(points, index)
+    nearest, away = _nearest_cameras(points, cameras.camera_to_worlds[:, :, 3], 4 * views)
+    for index in track(away.argsort().tolist(), "Looking up colours of points", len(cameras)):
+        here = ((nearest == index).any(1) & (count < views)).nonzero()[:, 0]
+        columns, rows, shown = cameras.project(points[here], index)
         height, width = int(cameras.heights[index]), int(cameras.widths[index])
         column, row = columns.round().long(), rows.round().long()
         shown &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        ranked = (distance < distance[:, index : index + 1]).sum(1) < 4 * views
-        shown &= ranked & (count < views)
         if not bool(shown.any()):
             continue
         pixels = dataset.image(index)[row[shown], column[shown]].float() / 255
         weight = pixels[:, 3] if pixels.shape[1] == 4 else torch.ones_like(pixels[:, 0])
         weight = (weight > 0.5).to(points)
-        total[shown] += weight[:, None] * pixels[:, :3]
-        count[shown] += weight
+        total[here[shown]] += weight[:, None] * pixels[:, :3]
+        count[here[shown]] += weight
     return torch.where(count[:, None] > 0, total / count[:, None].clamp(min=1), 0.5)
+
+
+def _nearest_cameras(points: Tensor, centers: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the nearest cameras (N, min(count, M)) int32 of points, and each camera's mean distance (M,) from them.
+
+    Args:
+        points: (N, 3), taken in parts, because all distances of millions of points exceed the memory.
+        centers: (M, 3) positions of the cameras.
+        count: number of cameras per point.
+    """
+    nearest, sums = [], torch.zeros(len(centers), dtype=torch.float64, device=points.device)
+    for some in points.split(max(PAIRS // len(centers), 1)):
+        distance = torch.cdist(some, centers)
+        nearest.append(distance.topk(min(count, len(centers)), largest=False).indices.int())
+        sums += distance.sum(0, dtype=torch.float64)
+    return torch.cat(nearest), sums / len(points)
 
 
 def hull_points(hull: Tensor, box: Tensor, resolution: int, count: int) -> Tensor:

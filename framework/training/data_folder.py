@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.data.folders import walk
 from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from nerfloom.registry import load_dataparser, registered
 
@@ -26,8 +27,12 @@ PARTS = re.compile(
 """Names of files and folders inside a data folder that users may pass instead of the folder itself."""
 MAX_LEVELS = 3
 """Maximum number of levels between such a part and the data folder."""
+ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".tgz", ".gz", ".xz", ".zst")
+"""Suffixes of archives."""
 MAX_FILES = 5000
 """Maximum number of files examined for advice."""
+MAX_FOLDERS = 100
+"""Maximum number of folders examined for advice."""
 
 
 def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None, str]:
@@ -56,8 +61,9 @@ def find_data(path: Path | None, named: str | None = None) -> tuple[Path | None,
                 f"--data {folder}: the format may be {several}; name it after the flags, such as '{matches[0]}'"
             )
     if named is not None:
+        _compare(path, named)
         return path, named
-    raise DataError(f"--data {path}: {_advice(path)}")
+    raise DataError(f"--data {path}: {_advice(path, formats)}")
 
 
 def _candidates(path: Path) -> Iterator[Path]:
@@ -94,30 +100,36 @@ def _recognizes(name: str, parser: type[DataParser], path: Path) -> bool:
         return False
 
 
-def _advice(path: Path) -> str:
-    """Return advice about a path that is not a data folder."""
+def _compare(path: Path, named: str) -> None:
+    """Report the formats that recognise a folder which the format that the user named does not recognise."""
+    formats = _formats(list(registered("dataparsers")))
+    if others := [name for name, parser in formats.items() if _recognizes(name, parser, path)]:
+        say(f"--data {path} looks like {' or '.join(others)}, not {named}; to read it as such, leave out {named}")
+
+
+def _advice(path: Path, formats: Mapping[str, type[DataParser]]) -> str:
+    """Return advice about a path that is not a data folder of the `formats`."""
     if not os.path.exists(path):
         return "there is no such folder"
     if os.path.isfile(path):
         if path.suffix.lower() in VIDEO_SUFFIXES:
             return f"a video has no camera poses yet. {_processing('video', path)}"
+        if path.suffix.lower() in ARCHIVES:
+            return "this is an archive; unpack it, and name the folder"
         if path.suffix.lower() == ".json":
             return f"this is a file, not a data folder; to read it as a transforms.json: --data {path} nerfstudio"
         return "this is a file, not a data folder"
-    files = [Path(folder, name) for folder, name in islice(_files(path), MAX_FILES)]
+    inside = (folder for folder, _ in islice(walk(path), 1, MAX_FOLDERS))
+    if data := [folder for folder in inside if any(_recognizes(name, formats[name], folder) for name in formats)]:
+        others = f"; {len(data) - 1} more folders have data" if len(data) > 1 else ""
+        return f"the data is in a folder inside: --data {shlex.quote(str(data[0]))}{others}"
+    files = list(islice((folder / name for folder, names in walk(path) for name in names), MAX_FILES))
     if count := sum(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
         number = f"{count} image{'s' if count > 1 else ''}" if len(files) < MAX_FILES else "images"
         return f"there are {number}, but no camera poses. {_processing('images', path)}"
     if videos := sorted(file for file in files if file.suffix.lower() in VIDEO_SUFFIXES):
         return f"a video has no camera poses yet. {_processing('video', videos[0])}"
     return f"the folder's format is unknown. Known: {', '.join(registered('dataparsers'))}"
-
-
-def _files(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield directory and name of every file below a folder, except hidden ones."""
-    for folder, below, names in os.walk(path):
-        below[:] = sorted(name for name in below if not name.startswith("."))
-        yield from ((folder, name) for name in names if not name.startswith("."))
 
 
 def _processing(kind: str, path: Path) -> str:

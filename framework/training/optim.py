@@ -12,9 +12,7 @@ from nerfloom.base.config import TrainConfig
 from nerfloom.base.device import StepValue
 from nerfloom.base.optimised import DefersGradient, ParameterGroup, RowChange
 from nerfloom.kernels.adam.adam import all_finite, dense_adam, sparse_adam
-from nerfloom.kernels.adam.row_gradient import RowGradient
-from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
-from nerfloom.kernels.grids.planes import PlanesGradient
+from nerfloom.kernels.adam.deferred import DeferredGradient
 from nerfloom.kernels.table_memory import IN_MEMORY, Tables, require
 from nerfloom.model import Model
 from nerfloom.renderable import parts
@@ -42,7 +40,7 @@ class Adam:
     def __init__(
         self,
         groups: list[dict[str, Any]],
-        deferred: Mapping[Any, TableGradient | PlanesGradient | RowGradient],
+        deferred: Mapping[Any, DeferredGradient],
         lr: float,
         betas: tuple[float, float],
         eps: float,

@@ -29,10 +29,13 @@ def config_file(path: Path) -> Path:
         path: the file itself, the run's folder, or a folder above it, such as ``outputs``.
 
     Raises:
-        ConfigError: if `path` is missing, or a folder without a run.
+        ConfigError: if `path` is missing, a checkpoint, or a folder without a run.
     """
     if not os.path.lexists(path):
         raise ConfigError(f"cannot read {path}: {os.strerror(errno.ENOENT)}{_nearest_to(path)}")
+    if path.suffix == ".ckpt":
+        run = path.absolute().parent.parent
+        raise ConfigError(f"{path} is a checkpoint; name its run, such as {run}, and the file by --load-checkpoint")
     if not os.path.isdir(path):
         return path
     for name in (CONFIG, BLOCKS):

@@ -23,6 +23,8 @@ PORTS_TRIED = 100
 """Number of ports tried, starting at the requested one."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 """Names of the loopback interface, which other machines cannot reach."""
+EVERYWHERE = ("0.0.0.0", "::")
+"""Hosts that stand for all interfaces of this machine."""
 
 
 def check_installed() -> None:
@@ -76,9 +78,15 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     bound = server.get_port()
     if bound != port:
         say(f"port {port} is taken")
-    shown = f"[{host}]" if ":" in host else host
-    say(f"viewer: http://{shown}:{bound}")
+    say(f"viewer: {addresses(host, bound)}")
     return server
+
+
+def addresses(host: str, port: int) -> str:
+    """Return the address of a server on `host` at `port`, and the one for other machines if it listens for them."""
+    if host in EVERYWHERE:  # no address that a browser can open on every system
+        return f"http://localhost:{port} (from other machines: http://{socket.gethostname()}:{port})"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def close_server(server: viser.ViserServer) -> None:
@@ -127,7 +135,8 @@ def _refuse(server: Any, is_local: bool) -> None:
         live = infra._live_connections[connection.client_id]
         headers = live.request.headers
         if not is_allowed(headers.get("Origin"), headers.get("Host"), is_local):
-            say(f"viewer: refused a connection of the page {headers.get('Origin')!r:.100}")
+            tunnel = f"ssh -L {server.get_port()}:localhost:{server.get_port()} HOST"
+            say(f"viewer: refused the page {headers.get('Origin')!r:.100}, not its own; from elsewhere: {tunnel}")
             await live.close(1008, "only the viewer's own page may connect")
 
     infra._client_connect_cb.insert(0, check)

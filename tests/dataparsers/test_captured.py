@@ -75,6 +75,17 @@ def test_large_images_are_read_from_the_folder_of_reduced_ones(capture: Path) ->
     assert worst_miss(scene, poses()[[0, 8]]) < EXACT
 
 
+def test_a_folder_of_some_reduced_images_is_not_used(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its command was stopped; all originals are there."""
+    write_alike(capture / "images", 1640, 1230)
+    write_alike(capture / "images_2", 820, 615)
+    (capture / "images_2" / NAMES[4]).unlink()
+    scene = Nerfstudio(eval_mode="all").parse(capture, "train")
+    assert len(scene.image_paths) == len(NAMES)
+    assert (scene.image_paths[0].parent.name, scene.downscale_factor) == ("images", 2)
+    assert "not all images have one reduced by 2 beside them; these are not used" in capsys.readouterr().err
+
+
 def test_reduced_images_may_be_all_there_is(capture: Path) -> None:
     """Their endings may differ too, as in LLFF."""
     shutil.rmtree(capture / "images")

@@ -303,6 +303,32 @@ def test_images_without_their_second_line_are_refused(folder: Path) -> None:
     file.write_text("\n".join([lines[0], *lines[1::2]]) + "\n")
     with pytest.raises(DataError, match=r"images\.txt: .*'p09\.png'"):
         Colmap().parse(folder, "train")
+    file.write_text("\n".join(lines[:-1]) + "\n")  # some programs leave out the last line if it is empty
+    with pytest.raises(DataError, match=r"images\.txt ends after the first line of image 'p\d\d\.png'; .* add a line"):
+        Colmap().parse(folder, "train")
+
+
+@pytest.mark.parametrize("change", [(".", ","), (" p00.png", ""), ("100 ", "one ")])
+def test_a_line_that_is_no_image_is_refused_by_its_number(folder: Path, change: tuple[str, str]) -> None:
+    """Programs of other languages write decimal commas, and those of one's own leave out values."""
+    file = folder / "sparse" / "0" / "images.txt"
+    lines = file.read_text().splitlines(keepends=True)
+    place = next(index for index, line in enumerate(lines) if line.endswith("p00.png\n"))
+    lines[place] = lines[place].replace(*change)
+    file.write_text("".join(lines))
+    with pytest.raises(DataError, match=rf"images\.txt: line {place + 1} is damaged: an image has a number, 4 numbers"):
+        Colmap().parse(folder, "train")
+
+
+def test_text_with_a_byte_order_mark_is_refused(folder: Path) -> None:
+    """COLMAP would take the mark for a part of the first line."""
+    for name in ("cameras", "images", "points3D"):
+        file = folder / "sparse" / "0" / f"{name}.txt"
+        text = file.read_text()
+        file.write_text(text, encoding="utf-8-sig")
+        with pytest.raises(DataError, match=rf"{name}\.txt begins with a byte-order mark.*save it without one"):
+            Colmap().parse(folder, "train")
+        file.write_text(text)
 
 
 def test_names_of_another_system(tmp_path: Path, capture: Capture, capsys: pytest.CaptureFixture[str]) -> None:

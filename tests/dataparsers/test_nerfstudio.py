@@ -352,17 +352,34 @@ def test_the_up_direction_that_a_file_states(capture: Path, stated: Any) -> None
     assert not of_the_flag.z_is_up
 
 
-def test_the_unit_of_depth_in_exr_is_said(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("ending", ["exr", "NPY"])
+def test_the_unit_of_depth_in_fractions_is_said(capture: Path, capsys: pytest.CaptureFixture[str], ending: str) -> None:
     (capture / "depth").mkdir()
-    write_exr(capture / "depth" / "000.exr", {"Z": np.full((HEIGHT, WIDTH), 2.5, np.float32)})
-    edit(capture, lambda c: c["frames"][0].update(depth_file_path="depth/000.exr"))
+    depth = np.full((HEIGHT, WIDTH), 2.5, np.float32)
+    write_exr(capture / "depth" / "000.exr", {"Z": depth})
+    np.save(capture / "depth" / "000.npy", depth[..., None])
+    (capture / "depth" / "000.npy").rename(capture / "depth" / "000.NPY")
+    edit(capture, lambda c: c["frames"][0].update(depth_file_path=f"depth/000.{ending}"))
     for factor, said in ((0.001, True), (1.0, False)):
         flags = Nerfstudio(eval_interval=0, depth_unit_scale_factor=factor)
         scene = flags.parse(capture, "train")
-        assert ("EXR files are read as millimetres" in capsys.readouterr().err) == said
+        assert ("depths are read as millimetres" in capsys.readouterr().err) == said
         depths = load_dataset(scene, "train").depths
         assert depths is not None
         assert float(depths.max()) == pytest.approx(2.5 * factor * scene.scale, rel=1e-3)
+
+
+def test_an_image_on_its_side_is_refused_with_what_turns_it(capture: Path) -> None:
+    """Programs that obey EXIF have cameras for the upright image."""
+    name = capture / "images" / "003.png"
+    for width, height, words in (
+        (HEIGHT, WIDTH, "30x40 pixels, but its camera is for 40x30: it is stored on its side; turn such images"),
+        (2 * HEIGHT, 2 * WIDTH, "it is stored on its side"),
+        (WIDTH, WIDTH, "it was cropped or rotated"),
+    ):
+        iio.imwrite(name, np.zeros((height, width, 3), np.uint8))
+        with pytest.raises(DataError, match=words):
+            ALL.parse(capture, "train")
 
 
 def test_missing_images_are_skipped_and_reported_once(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -477,6 +494,14 @@ def test_bad_content_is_refused_by_name(capture: Path, name: str) -> None:
     assert "\n" not in str(error.value)
     assert str(capture) in str(error.value)
     assert len(str(error.value)) < 300 + len(str(capture)) + 2 * (name == "endless file name")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be", "utf-32"])
+def test_encodings_of_windows(capture: Path, encoding: str) -> None:
+    # Notepad marks UTF-8, and a redirection in PowerShell writes UTF-16.
+    file = capture / "transforms.json"
+    file.write_text(file.read_text(), encoding=encoding)
+    assert worst_miss(ALL.parse(capture, "train"), poses()) < EXACT
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '"text"', "\x00\xff", "[" * 100_000])

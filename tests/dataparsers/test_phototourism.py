@@ -52,6 +52,12 @@ def test_splits_are_the_tables(folder: Path, capture: Capture) -> None:
     assert data.image(6).shape[:2] == (20, 30)
 
 
+def test_a_table_that_a_spreadsheet_of_windows_has_saved(folder: Path) -> None:
+    text = (folder / "gate.tsv").read_text()
+    (folder / "gate.tsv").write_text(text, encoding="utf-8-sig")
+    assert len(Phototourism().parse(folder, "train").image_paths) == 7
+
+
 def test_a_reconstruction_at_the_usual_place_is_colmaps(folder: Path, capture: Capture) -> None:
     assert not Colmap.recognizes(folder)
     assert not Llff.recognizes(folder)

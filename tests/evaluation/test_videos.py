@@ -43,6 +43,14 @@ def test_an_animation_has_all_its_frames_and_their_duration(tmp_path: Path, endi
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
+def test_a_colon_in_a_name_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.chdir(tmp_path)
+    write_video(Path("12:30.mp4"), iter(greys(50, 200)), fps=10)
+    pictures = iio.imread(tmp_path / "12:30.mp4", plugin="FFMPEG")
+    assert [round(float(picture.mean())) for picture in pictures] == pytest.approx([50, 200], abs=6)
+
+
 @pytest.mark.parametrize("fps", [24, 30, 48])
 @pytest.mark.parametrize(("ending", "unit"), [(".gif", 10), (".webp", 1), (".png", 1)])
 def test_an_animation_is_as_long_as_its_frames(tmp_path: Path, ending: str, unit: int, fps: int) -> None:

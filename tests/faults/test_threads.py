@@ -13,7 +13,7 @@ from nerfloom.data.pixels.batch import draw_pixels
 from nerfloom.data.pixels.cache import PixelMemory
 from nerfloom.data.pixels.memory_mapped import MappedPixels
 from nerfloom.data.pixels.stream import FIRST_STEPS, PixelStream
-from nerfloom.training.checkpoint import load_checkpoint
+from nerfloom.training.checkpoint import list_checkpoints, load_checkpoint
 from tests.images import write_noise
 from tests.patience import PATIENCE
 from tests.training.helpers import tiny_trainer
@@ -34,6 +34,13 @@ def error_of(work: Callable[[], object]) -> BaseException | None:
     thread.join(PATIENCE)
     assert not thread.is_alive(), "it hangs"
     return raised[0] if raised else None
+
+
+def test_a_program_trains_in_a_thread_of_its_own(shared_tiny: Path, tmp_path: Path) -> None:
+    """As servers and graphical programs do; only the main thread may handle signals."""
+    trainer = tiny_trainer("instant-ngp", shared_tiny, tmp_path / "run", max_num_iterations=2)
+    assert error_of(trainer.train) is None
+    assert [path.name for path in list_checkpoints(trainer.checkpoint_folder)] == ["step-000000002.ckpt"]
 
 
 class Dying:

@@ -30,7 +30,7 @@ from nerfloom.kernels.histograms.intervals import (
     resample,
     resample_reference,
 )
-from nerfloom.kernels.images.ssim import ssim, ssim_reference
+from nerfloom.kernels.images.ssim import similarity_reference, ssim
 from nerfloom.kernels.march.occupancy import Occupancy, refresh_occupancy
 from nerfloom.kernels.march.waves import CompiledMarch, ReferenceMarch
 from nerfloom.kernels.native import torch_on_one_thread
@@ -167,7 +167,7 @@ def differentiable() -> dict[str, tuple[Callable[..., Tensor], Callable[..., Ten
         "blended Gaussians": (on_image(blend), on_image(blend_reference), [wide_records(2000)], 5),
         "similarity": (
             lambda x: ssim(x, target)[None, None],
-            lambda x: ssim_reference(x, target.double())[None, None],
+            lambda x: similarity_reference(x, target.double(), None, True)[None, None],
             [torch.rand(150, 140, 3)],
             1,
         ),

@@ -50,11 +50,14 @@ MUTANTS = {
             "test_appearance.py::test_it_looks_at_opaque_and_kept_pixels_only"),
     ],
     "nerfloom.data.masks": [
-        Mutant("mask-inverted", "read_mask", "A >= B", "A < B",
+        Mutant("mask-inverted", "read_white", "A >= B", "A < B",
             "what a mask hides is learnt from, and the rest ignored",
             "test_masks.py::test_grey_is_split_in_the_middle_and_colour_modes_do_not_matter"),
     ],
     "nerfloom.data.names_on_disk": [
+        Mutant("phone-mask-of-other-name", "companions_of", "found.get(spelled(name), A)", "A",
+            "masks named as COLMAP names them are not found",
+            "dataparsers/test_colmap.py::test_masks_are_found_by_the_images_name"),
         Mutant("masks-for-images", "_moved", "(A for part in B[:-length])", "(A for part in B[:0])",
             "where images are missing, masks of their names are learnt from",
             "test_names_on_disk.py::test_nothing_is_taken_where_two_come_into_question"),
@@ -177,11 +180,6 @@ MUTANTS = {
         Mutant("llff-bounds-not-scaled", "Llff.parse", "A * scene.scale", "A",
             "LLFF's near and box are in the input's unit and not in the scene's",
             "dataparsers/test_llff.py::test_real_captures"),
-    ],
-    "nerfloom.dataparsers.masks": [
-        Mutant("phone-mask-of-other-name", "find_masks", "(spelled(name), A)", "(A,)",
-            "masks named as COLMAP names them are not found",
-            "dataparsers/test_colmap.py::test_masks_are_found_by_the_images_name"),
     ],
     "nerfloom.dataparsers.nerfstudio": [
         Mutant("nerfstudio-train-takes-all", "_listed", "A - held", "A",

@@ -9,7 +9,7 @@ from PIL import Image, features
 from nerfloom.base import extras
 from nerfloom.base.errors import DataError
 from nerfloom.data.image_files import image_size, read_image
-from nerfloom.processing.images import output_names, prepare, prepare_all
+from nerfloom.processing.images import output_names, prepare, prepare_all, write_masks
 from nerfloom.processing.listing import find_images
 
 
@@ -32,6 +32,8 @@ def test_photographs_are_found_below_and_sorted_as_people_count(tmp_path: Path) 
     assert [p.as_posix() for p in find_images(tmp_path)] == ["a 1.PNG", "b/img2.png", "b/img10.png"]
     assert [p.as_posix() for p in find_images(tmp_path, leave_out=[tmp_path / "b"])] == ["a 1.PNG"]
     (tmp_path / "c").mkdir()
+    with pytest.raises(DataError, match=r"a 1\.PNG is a file; name the folder of the images"):
+        find_images(tmp_path / "a 1.PNG")
     with pytest.raises(DataError, match="has no image"):
         find_images(tmp_path / "c")
 
@@ -93,6 +95,7 @@ def test_digits_that_are_no_numbers_are_letters(tmp_path: Path) -> None:
 def test_names_are_safe_and_different() -> None:
     names = output_names([Path("a b.JPG"), Path("a_b.jpg"), Path("sub dir/x.tif"), Path("A_B.jpg")])
     assert names == ["a_b.jpg", "a_b_2.jpg", "sub_dir/x.png", "A_B_3.jpg"]
+    assert output_names([Path("#1.jpg"), Path("_1.jpg"), Path("a/#1.jpg")]) == ["_1.jpg", "_1_2.jpg", "a/#1.jpg"]
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
@@ -123,3 +126,40 @@ def test_damaged_photographs_are_left_out_and_named(tmp_path: Path) -> None:
     assert [p.source for p in photographs] == ["good.png"]
     assert len(unreadable) == 2
     assert "bad.png" in unreadable[0]
+
+
+def test_masks_are_found_whatever_they_are_saved_as(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ["a.png", "cam/B.JPG", "cam/c.jpg", "d.jpg", "e.jpg"]
+    for name in names:
+        write(tmp_path / "given" / name)
+    left = np.repeat([[255, 255, 255, 0, 0, 0]], 4, 0).astype(np.uint8)
+    for name in ("a.bmp", "cam/b.PNG", "cam/c.jpg.png", "d.png"):
+        (tmp_path / "masks" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(left // 255 if name == "d.png" else left).save(tmp_path / "masks" / name)
+    prepared, _ = prepare_all(tmp_path / "given", [Path(name) for name in names], tmp_path / "out")
+    written = write_masks(tmp_path / "masks", prepared, tmp_path / "written")
+    assert set(written) == {"a.png", "cam/B.jpg", "cam/c.jpg", "d.jpg"}
+    for name in written.values():
+        assert np.array_equal(np.asarray(Image.open(tmp_path / "written" / name)), left)
+    assert "1 of 5 images have no mask, the first e.jpg" in capsys.readouterr().err
+    (tmp_path / "others").mkdir()
+    with pytest.raises(DataError, match=r"has no mask; the first expected is a\.png"):
+        write_masks(tmp_path / "others", prepared, tmp_path / "written")
+
+
+def test_profiles_of_other_colours_are_not_kept(tmp_path: Path) -> None:
+    """Programs that manage colours would take RGB for what the profile describes, or refuse the file."""
+    for colours, mode, suffix in ((b"RGB ", "P", "png"), (b"GRAY", "L", "jpg"), (b"CMYK", "CMYK", "jpg")):
+        profile = bytes(16) + colours + bytes(108)
+        name = f"{mode}.{suffix}"
+        Image.new("RGB", (6, 4), "red").convert(mode).save(tmp_path / name, icc_profile=profile)
+        prepare(tmp_path, Path(name), tmp_path / "out", name)
+        with Image.open(tmp_path / "out" / name) as image:
+            assert image.mode == "RGB"
+            assert image.info.get("icc_profile", b"") == (profile if mode == "P" else b"")
+
+
+def test_pixels_without_a_white_level_are_refused_by_name(tmp_path: Path) -> None:
+    Image.fromarray(np.ones((4, 6), np.float32)).save(tmp_path / "bright.tif")
+    with pytest.raises(DataError, match=r"bright\.tif is not a readable image: floating-point pixels; convert it"):
+        prepare(tmp_path, Path("bright.tif"), tmp_path / "out", "bright.png")

@@ -25,6 +25,30 @@ def test_other_files_are_counted_and_named(tmp_path: Path, capsys: pytest.Captur
         find_images(tmp_path / "raw")
 
 
+def test_masks_beside_photographs_are_no_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    touch(tmp_path, "images/1.jpg", "images/2.jpg", "Masks/1.png", "Masks/2.png", "depth/left/1.png")
+    assert [path.as_posix() for path in find_images(tmp_path)] == ["images/1.jpg", "images/2.jpg"]
+    assert "left out: 3 images in folders such as " in capsys.readouterr().err
+    assert [path.as_posix() for path in find_images(tmp_path / "depth")] == ["left/1.png"]
+    touch(tmp_path / "labels of a museum", "mask/1.jpg")
+    assert [path.as_posix() for path in find_images(tmp_path / "labels of a museum")] == ["mask/1.jpg"]
+
+
+def test_linked_photographs_are_found_once(tmp_path: Path) -> None:
+    touch(tmp_path / "disk" / "deep", "1.jpg", "2.jpg")
+    folder = touch(tmp_path / "given", "0.jpg")
+    (folder / "camera").symlink_to(tmp_path / "disk")
+    (folder / "camera, again").symlink_to(tmp_path / "disk")
+    (tmp_path / "disk" / "circle").symlink_to(folder)
+    (folder / "9.jpg").symlink_to(tmp_path / "gone.jpg")  # listed, so that it is reported when it is read
+    assert [path.as_posix() for path in find_images(folder)] == [
+        "0.jpg",
+        "9.jpg",
+        "camera/deep/1.jpg",
+        "camera/deep/2.jpg",
+    ]
+
+
 def test_a_video_and_a_folder_are_told_apart(tmp_path: Path) -> None:
     images, films = touch(tmp_path / "i", "1.jpg", "x.mp4"), touch(tmp_path / "v", "clip.MP4", "notes.txt")
     assert kind_of("images", images) == ("images", images)

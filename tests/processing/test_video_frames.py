@@ -112,6 +112,15 @@ def test_repeats_are_dropped_and_counted(tmp_path: Path, capsys: pytest.CaptureF
     assert "using all 10, fewer than --num-frames-target 50" in said
 
 
+def test_a_colon_in_a_name_is_no_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_video(tmp_path / "plain.mp4", [1, 2, 3], "N/30")
+    (tmp_path / "plain.mp4").rename(tmp_path / "12:30.mp4")
+    monkeypatch.chdir(tmp_path)
+    assert frame_count(Path("12:30.mp4")) == 3
+    assert survey(Path("12:30.mp4"), lambda picture: number_of(picture[..., None]))[1] == [1, 2, 3]
+    assert [number_of(f) for f in chosen_frames(Path("12:30.mp4"), np.array([1]))] == [2]
+
+
 def test_what_a_video_holds_is_said() -> None:
     assert line(np.arange(4) / 2, 4, 2, 2) == "video: 4 frames in 1.5 s; using 2, the sharpest of each of 2 intervals"
     assert "at uneven times" in line(np.array([0, 1, 1.1, 1.2, 3]), 5, 2, 2)
@@ -121,6 +130,8 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     with pytest.raises(DataError, match="there is no such file"):
         frame_count(tmp_path / "none.mp4")
+    with pytest.raises(DataError, match="is a folder without a video"):
+        frame_count(tmp_path)
     (tmp_path / "damaged.mp4").write_bytes(b"no video")
     with pytest.raises(DataError, match="not a readable video"):
         frame_count(tmp_path / "damaged.mp4")

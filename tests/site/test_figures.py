@@ -40,6 +40,14 @@ def test_tables_are_those_of_their_results(tables: ModuleType) -> None:
         assert tables.filled(text, known) == text, f"{page}: python -m docs.building.tables"
 
 
+def test_figures_stand_on_the_line_of_their_names(tables: ModuleType) -> None:
+    """A line's end between the two would leave the figure as it is, and no test would find it stale."""
+    for page in tables.PAGES:
+        text = re.sub(r"```.*?```|`[^`]*`", "", (DOCS / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+        named = re.findall(r"<!--\s(?!measured)[\w.-]+(?:\s[-/]\s[\w.-]+)?:\s[^:>]+-->", text)
+        assert len(named) == len(tables.FIGURE.findall(text)), page
+
+
 def evaluation(psnr: float, **run: float) -> dict[str, Any]:
     return {"results": {"psnr": psnr, "ssim": 0.9, "fps": 4.0}, "run": run, "per_image": []}
 

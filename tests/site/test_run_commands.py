@@ -176,5 +176,5 @@ def test_a_benchmark_writes_what_it_measured(what: str, folder: Path, monkeypatc
 def test_enough_is_run() -> None:
     assert len(RUNNING) > 35
     benchmarks = [*KINDS, *ours.KINDS]
-    elsewhere = {"gpu", "quadrature", "processes", "contention", "cache", "poses"}
+    elsewhere = {"gpu", "quadrature", "processes", "contention", "cache", "poses", "city"}
     assert set(benchmarks) - elsewhere <= set(MEASURED) | {"tables"}

@@ -18,7 +18,7 @@ from nerfloom.cli.export import main
 from nerfloom.data.offsets import offset_file, read_offset
 from nerfloom.data.ply import read_columns, read_header, write_columns
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics_reference
-from nerfloom.splats.files import read_gaussians, write_gaussians
+from nerfloom.splats.files import READ, SUFFIXES, read_gaussians, write_gaussians
 from nerfloom.splats.gaussian_limit import colour_error, fitted_ply, fitted_spz, visibility
 from nerfloom.splats.gaussians import Gaussians
 from nerfloom.splats.look import OURS, Look
@@ -189,6 +189,23 @@ def test_what_cannot_be_rendered_is_left_out_and_counted(tmp_path: Path, capsys:
     write_ply(tmp_path / "a.ply", gaussians)
     with pytest.raises(DataError, match="none of its 9 Gaussians is finite"):
         gaussians_in(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("ending", SUFFIXES)
+def test_flat_gaussians_of_other_programs(tmp_path: Path, ending: str) -> None:
+    # Programs that make discs write the size 0 along the third axis, with an infinite logarithm.
+    gaussians = some(9, 0)
+    gaussians.log_scales[4:, 2] = -math.inf
+    write_ply(tmp_path / "a.ply", gaussians)
+    read = gaussians_in(tmp_path / "a.ply")
+    assert torch.equal(read.log_scales[:, :2], gaussians.log_scales[:, :2])
+    assert (read.log_scales[4:, 2] < -20).all()
+    write_gaussians(file := tmp_path / f"b{ending}", read)
+    if ending in READ:
+        sizes = gaussians_in(file).log_scales.sort(-1).values  # some formats have another order
+        largest = [one.log_scales.amax(-1).sort().values for one in (gaussians_in(file), read)]
+        assert torch.allclose(*largest, atol=0.1)
+        assert int((sizes[:, 0] < -9.9).sum()) == 5
 
 
 def refused_in_a_line(file: Path, content: bytes) -> str:

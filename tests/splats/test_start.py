@@ -10,6 +10,7 @@ import torch
 from nerfloom.data.dataset import load_dataset
 from nerfloom.dataparsers.blender import Blender
 from nerfloom.kernels.splats.project import DC
+from nerfloom.splats import start
 from nerfloom.splats.start import (
     first_points,
     from_points,
@@ -91,6 +92,37 @@ def test_colours_are_those_of_the_nearest_image(shared_tiny: Path) -> None:
     just_before = rays.origins + 0.05 * rays.directions  # no other camera is as near
     found = seen_colors(just_before, dataset, views=1)[0]
     torch.testing.assert_close(found, image[row, column, :3].float() / 255)
+
+
+def test_colours_are_means_over_the_nearest_images_that_show_a_point(
+    shared_tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = load_dataset(Blender().parse(shared_tiny, "train"), "train")
+    monkeypatch.setattr(start, "PAIRS", 3 * len(dataset.cameras))  # distances in parts of three points
+    points, views = torch.rand(40, 3) * 2 - 1, 2
+    expected = []
+    for point in points:
+        away = (dataset.cameras.camera_to_worlds[:, :, 3].double() - point.double()).norm(dim=-1)
+        colors = {}
+        for index in away.argsort()[: 4 * views].tolist():
+            column, row, front = (part[0] for part in dataset.cameras.project(point[None], index))
+            column, row = round(float(column)), round(float(row))
+            image = dataset.image(index)
+            if (
+                bool(front)
+                and 0 <= row < image.shape[0]
+                and 0 <= column < image.shape[1]
+                and image[row, column, 3] > 127
+            ):
+                colors[index] = image[row, column, :3].double() / 255
+        expected.append(colors)
+    found = seen_colors(points, dataset, views)
+    means = torch.cdist(points, dataset.cameras.camera_to_worlds[:, :, 3]).double().mean(0)
+    for color, colors in zip(found, expected, strict=True):
+        chosen = [colors[index] for index in sorted(colors, key=lambda i: float(means[i]))[:views]]
+        wanted = torch.stack(chosen).mean(0) if chosen else torch.full((3,), 0.5, dtype=torch.float64)
+        torch.testing.assert_close(color.double(), wanted, atol=1e-6, rtol=0)
+    assert sum(map(bool, expected)) > 5
 
 
 def test_what_no_image_shows_is_grey(shared_tiny: Path) -> None:

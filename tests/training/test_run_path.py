@@ -43,6 +43,9 @@ def test_what_is_missing_is_named_with_the_nearest_that_is_there(tmp_path: Path)
         config_file(tmp_path / "cup" / "nerfacto" / "2026-01-02_030406")
     with pytest.raises(ConfigError, match=r"Did you mean 'nerfacto'\? \(in .*cup\)"):
         config_file(tmp_path / "cup" / "nerfato" / "2026-01-02_030405")
+    checkpoint = tmp_path / "cup" / "nerfacto" / "2026-01-02_030405" / "nerfstudio_models" / "step-000000007.ckpt"
+    with pytest.raises(ConfigError, match=r"is a checkpoint; name its run, such as .*/2026-01-02_030405, and"):
+        config_file(checkpoint)
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match="there is no run below it"):
         config_file(tmp_path / "empty")

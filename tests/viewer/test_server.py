@@ -24,7 +24,7 @@ from nerfloom.viewer.page import Page
 from nerfloom.viewer.photographs import Photographs
 from nerfloom.viewer.render_queue import RenderQueue
 from nerfloom.viewer.request import pose_of, quaternion_of
-from nerfloom.viewer.server import free_port, is_allowed
+from nerfloom.viewer.server import addresses, free_port, is_allowed
 from nerfloom.viewer.training_viewer import in_training
 from tests.training.helpers import tiny_run
 
@@ -355,6 +355,15 @@ def test_origins() -> None:
     assert not is_allowed("http://evil.example:7007", "evil.example:7007", True)  # its name made to mean 127.0.0.1
     assert is_allowed("http://machine:7007", "machine:7007", False)
     assert not is_allowed("file://", "127.0.0.1:7007", True)
+
+
+def test_the_address_that_is_said_can_be_opened() -> None:
+    assert addresses("127.0.0.1", 7007) == "http://127.0.0.1:7007"
+    assert addresses("::1", 7008) == "http://[::1]:7008"
+    for host in ("0.0.0.0", "::"):
+        here, others = addresses(host, 7007).split(" (from other machines: ")
+        assert here == "http://localhost:7007"
+        assert others == f"http://{socket.gethostname()}:7007)"
 
 
 def test_ports() -> None:

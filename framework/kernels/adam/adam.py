@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,10 +78,8 @@ def sparse_adam(
 SPARSE_ADAM: Operation[..., int | Tensor] = Operation("sparse_adam", sparse_adam_reference)
 
 
-def _known_to_python(
-    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
-    rate: float | Tensor, betas: tuple[float, float], eps: float, found_inf: Tensor | None = None,
-) -> bool:  # fmt: skip
+def _known_to_python(*given: Any) -> bool:
+    rate, _, _, found_inf = given[5:]
     return found_inf is None and not isinstance(rate, Tensor)
 
 
@@ -121,14 +120,9 @@ def _masked_adam(
     return touched.sum()
 
 
-def _all_rows_contiguous(
-    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
-    rate: float | Tensor, betas: tuple[float, float], eps: float, found_inf: Tensor | None = None,
-) -> bool:  # fmt: skip
-    return all(tensor.is_contiguous() for tensor in (values, grad, mean, square, seen))
-
-
-SPARSE_ADAM.implementation(TRITON, fits=_all_rows_contiguous)(later("adam.adam_triton", "sparse_adam"))
+SPARSE_ADAM.implementation(TRITON, fits=lambda *given: all(tensor.is_contiguous() for tensor in given[:5]))(
+    later("adam.adam_triton", "sparse_adam")
+)
 
 
 @torch.no_grad()
@@ -173,14 +167,11 @@ def dense_adam(
     DENSE_ADAM((*values, *grads), values, grads, means, squares, steps, rate, betas, eps, found_inf)
 
 
-DENSE_ADAM = Operation("dense_adam", dense_adam_reference)
+DENSE_ADAM: Operation[..., None] = Operation("dense_adam", dense_adam_reference)
 
 
-def _compiled_fits(
-    values: Sequence[Tensor], grads: Sequence[Tensor], means: Sequence[Tensor], squares: Sequence[Tensor],
-    steps: Sequence[Tensor], rate: float | Tensor, betas: tuple[float, float], eps: float,
-    found_inf: Tensor | None = None,
-) -> bool:  # fmt: skip
+def _compiled_fits(*given: Any) -> bool:
+    values, grads, *_, rate, _, _, found_inf = given
     known = found_inf is None and not isinstance(rate, Tensor)
     return known and all(tensor.is_contiguous() for tensor in (*values, *grads))
 

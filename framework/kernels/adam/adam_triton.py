@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from nerfloom.kernels.triton_launch import blocks, launch, on_device, opacity_of
+from nerfloom.kernels.triton_launch import blocks, launch, on_device, opacity_of, own_rows
 
 BLOCK = 1024
 """Number of values per program."""
@@ -24,9 +24,8 @@ def _sparse(
     decay1, decay2, eps,
     ROWS: tl.constexpr, F: tl.constexpr,
 ):  # fmt: skip
-    e = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    e, here = own_rows(entries, ROWS)
     f = tl.arange(0, F)
-    here = e < entries
     at = e[:, None] * features + f[None, :]
     there = here[:, None] & (f < features)[None, :]
     g = tl.load(grad + at, mask=there, other=0.0)

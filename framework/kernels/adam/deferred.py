@@ -2,13 +2,55 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from nerfloom.kernels.adam.adam import sparse_adam
+
 Parts = list[tuple[Tensor, Tensor]]
 """Positions (N, D) of each look-up, and gradient (N, width) of its result."""
+
+
+class DeferredGradient(ABC):
+    """The gradient of a table, collected in backward passes, which an optimiser sums and applies."""
+
+    def __init__(self) -> None:
+        self.parts: Parts = []
+        """Parts of the gradient, one from each look-up in a backward pass."""
+
+    @property
+    def pending(self) -> bool:
+        """True if there is a gradient."""
+        return bool(self.parts)
+
+    @property
+    def gradients(self) -> list[Tensor]:
+        """The collected gradients."""
+        return [gradient for _, gradient in self.parts]
+
+    def clear(self) -> None:
+        """Discard the gradient."""
+        self.parts.clear()
+
+    @abstractmethod
+    def summed(self, table: Tensor) -> Tensor:
+        """Return the accumulated gradient (E, F) of `table` and discard it.
+
+        The result's memory may be reused: its entries must be zero before the next call, as Adam leaves them.
+        """
+
+    def adam(
+        self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
+        rate: float, betas: tuple[float, float], eps: float,
+    ) -> int | Tensor:  # fmt: skip
+        """Update `table` (E, F) by `sparse_adam` with this gradient, and discard the gradient.
+
+        `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
+        """
+        return sparse_adam(table, self.summed(table), mean, square, seen, rate, betas, eps)
 
 
 class _Waiting(torch.autograd.Function):

@@ -6,38 +6,16 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native
-from nerfloom.kernels.adam.deferred import Parts, waiting
+from nerfloom.kernels.adam.deferred import DeferredGradient, waiting
 from nerfloom.kernels.dispatch import CPP, Operation
 
 _adam = native.Function("adam_rows", "ppppppqifddfi")
 
 
-class RowGradient:
-    """The deferred gradient of a table: some of its rows, from each backward pass.
-
-    It has the methods of `nerfloom.kernels.grids.hash_grid_lookup.TableGradient`.
-    """
-
-    def __init__(self) -> None:
-        self.parts: Parts = []
-        """Rows (T,) int32 of the table, each once, and their gradient (T, F), of each backward pass."""
-
-    @property
-    def pending(self) -> bool:
-        """True if there is a gradient."""
-        return bool(self.parts)
-
-    @property
-    def gradients(self) -> list[Tensor]:
-        """The collected gradients (T, F)."""
-        return [gradient for _, gradient in self.parts]
-
-    def clear(self) -> None:
-        """Discard the gradient."""
-        self.parts.clear()
+class RowGradient(DeferredGradient):
+    """The deferred gradient of a table: rows (T,) int32, each once, and gradients (T, F), of each backward pass."""
 
     def summed(self, table: Tensor) -> Tensor:
-        """Return the gradient (E, F) of `table` and discard it."""
         total = torch.zeros_like(table)
         for rows, gradient in self.parts:
             total.index_add_(0, rows, gradient)
@@ -48,10 +26,6 @@ class RowGradient:
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
         rate: float, betas: tuple[float, float], eps: float,
     ) -> int | Tensor:  # fmt: skip
-        """Update `table` (E, F) by `kernels.adam.adam.sparse_adam` with this gradient, and discard the gradient.
-
-        `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
-        """
         rows, gradient = self._merged(len(table))
         shape, count = (table.shape[0], table.shape[1]), len(rows)
         _adam(

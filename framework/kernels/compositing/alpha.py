@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
 from nerfloom.kernels.compositing.density import Composited, composite
+from nerfloom.kernels.math import at_least_float32
 
 LEFT_BEHIND = 4e-4
 """Maximum transmittance behind a sample with an alpha of 1, in float32 (`alpha_depth`)."""
@@ -33,7 +34,7 @@ def alpha_depth(alpha: Tensor) -> Tensor:
     Returns:
         Optical depth (N,), float64 if `alpha` is float64, and float32 otherwise.
     """
-    alpha = alpha if alpha.dtype == torch.float64 else alpha.float()
+    alpha = at_least_float32(alpha)
     most = 1 - torch.finfo(alpha.dtype).eps ** 0.5
     return -torch.log1p(-(alpha - (alpha - alpha.clamp(max=most)).detach()))
 
@@ -57,18 +58,10 @@ def composite_alpha(samples: Samples, alpha: Tensor, rgb: Tensor, background: Te
     """Composite packed samples with alphas.
 
     Weights differ from the products T_i alpha_i by at most sqrt(eps) of the type of `alpha` (3.5e-4 in float32).
+    `rgb`, `background`, `fars`, the result and errors are as in `composite`.
 
     Args:
         samples: N samples of R rays; only their order and t are used.
         alpha: (N,) opacity of each sample in [0, 1].
-        rgb: (N, 3) colour in [0, 1].
-        background: (R, 3) or (3,) colour in [0, 1] of the background.
-        fars: (R,) distance of the far end of each ray.
-
-    Returns:
-        Colour, opacity and depth of R rays, and the weights.
-
-    Raises:
-        IndexError: if the offsets of the samples do not divide them between the rays.
     """
     return composite(*unit_intervals(samples, alpha), rgb, background, fars)

@@ -139,10 +139,7 @@ class Composited(NamedTuple):
 
 
 def composite_reference(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """Compute `composite` in PyTorch, on any device and for any float type.
-
-    `samples`, `sigma`, `rgb`, `background` and `fars` are as in `composite`.
-    """
+    """Compute `composite` of `samples`, `sigma`, `rgb`, `background` and `fars` in PyTorch, for any float type."""
     weights, transmittance = weights_and_transmittance(sigma, samples)
     opacity = ray_sum(weights, samples)
     left = (1 - opacity).clamp(min=0)
@@ -254,23 +251,19 @@ _distortion = native.Function("distortion", "ppppqqppi")
 
 
 class _Distortion(torch.autograd.Function):
+    """The distortion (R,), computed together with its gradient (N,) by the weights."""
+
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
-        count, rays = len(weights), len(offsets) - 1
-        loss, grad_weights = weights.new_empty(rays), torch.empty_like(weights)
-        _distortion(
-            native.pointer(weights, "weights", (count,)), native.pointer(starts, "t_starts", (count,)),
-            native.pointer(ends, "t_ends", (count,)), native.pointer(offsets, "offsets", (rays + 1,), torch.int64),
-            rays, count, loss.data_ptr(), grad_weights.data_ptr(), native.threads(),
-        )  # fmt: skip
-        ctx.save_for_backward(grad_weights, offsets)
+    def forward(ctx: Any, computed: tuple[Tensor, Tensor], offsets: Tensor, weights: Tensor) -> Tensor:
+        loss, gradient = computed
+        ctx.save_for_backward(gradient, offsets)
         return loss
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        grad_weights, offsets = ctx.saved_tensors
-        return grad_weights * grad.repeat_interleave(offsets[1:] - offsets[:-1]), None, None, None
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, Tensor]:
+        gradient, offsets = ctx.saved_tensors
+        return None, None, gradient * grad.repeat_interleave(offsets[1:] - offsets[:-1], output_size=len(gradient))
 
 
 def distortion(weights: Tensor, samples: Samples) -> Tensor:
@@ -298,8 +291,15 @@ DISTORTION = Operation("distortion", distortion_reference)
 
 @DISTORTION.implementation(CPP, differentiable=1)
 def _distortion_compiled(weights: Tensor, samples: Samples) -> Tensor:
-    inputs = (tensor.contiguous() for tensor in (weights, samples.t_starts, samples.t_ends))
-    return _Distortion.apply(*inputs, samples.offsets)
+    weights, starts, ends = (tensor.contiguous() for tensor in (weights, samples.t_starts, samples.t_ends))
+    count, rays, offsets = len(weights), samples.num_rays, samples.offsets
+    loss, gradient = weights.new_empty(rays), torch.empty_like(weights)
+    _distortion(
+        native.pointer(weights, "weights", (count,)), native.pointer(starts, "t_starts", (count,)),
+        native.pointer(ends, "t_ends", (count,)), native.pointer(offsets, "offsets", (rays + 1,), torch.int64),
+        rays, count, loss.data_ptr(), gradient.data_ptr(), native.threads(),
+    )  # fmt: skip
+    return _Distortion.apply((loss, gradient), offsets, weights)
 
 
 DISTORTION.implementation(TRITON, differentiable=1)(later("compositing.density_triton", "distortion"))

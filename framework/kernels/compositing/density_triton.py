@@ -17,8 +17,8 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.geometry.rays import Samples
-from nerfloom.kernels.compositing.density import Composited
-from nerfloom.kernels.triton_launch import depth_slope, launch, opacity_of, optical_depth
+from nerfloom.kernels.compositing.density import Composited, _Distortion
+from nerfloom.kernels.triton_launch import depth_slope, launch, opacity_of, optical_depth, store_three
 
 BLOCK = 32
 """Samples of a ray processed together, by one warp."""
@@ -107,9 +107,7 @@ def _backward(
         slope = depth_slope(density, delta)
         gradient = tl.where(slope == 0, 0.0, slope * (own * in_front * tl.exp(-tau) - later))
         tl.store(of_sigma + n, gradient, mask=here)
-        tl.store(of_rgb + n * 3, weight * red, mask=here)
-        tl.store(of_rgb + n * 3 + 1, weight * green, mask=here)
-        tl.store(of_rgb + n * 3 + 2, weight * blue, mask=here)
+        store_three(of_rgb + n * 3, weight * red, weight * green, weight * blue, here)
 
 
 class _Composite(torch.autograd.Function):
@@ -147,10 +145,7 @@ class _Composite(torch.autograd.Function):
 
 
 def composite(samples: Samples, sigma: Tensor, rgb: Tensor, background: Tensor, fars: Tensor) -> Composited:
-    """Compute `nerfloom.kernels.compositing.density.composite`, with gradients of density and colour.
-
-    `samples`, `sigma`, `rgb`, `background` and `fars` are as there.
-    """
+    """Compute `density.composite` of `samples`, `sigma`, `rgb`, `background` and `fars`, with its gradients."""
     points = None if samples.points is None else samples.points.contiguous()
     inputs = (tensor.contiguous() for tensor in (sigma, rgb, samples.t_starts, samples.t_ends))
     offsets, background, fars = samples.offsets.contiguous(), background.contiguous(), fars.contiguous()
@@ -199,27 +194,10 @@ def _distortion(weights, starts, ends, offsets, loss, of_weights, BLOCK: tl.cons
         tl.store(of_weights + n, tl.load(of_weights + n, mask=here, other=0.0) + 2 * behind, mask=here)
 
 
-class _Distortion(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
-        rays = len(offsets) - 1
-        loss, of_weights = weights.new_empty(rays), torch.empty_like(weights)
-        launch(_distortion, (rays,), weights, starts, ends, offsets, loss, of_weights, BLOCK=BLOCK, num_warps=1)
-        ctx.save_for_backward(of_weights, offsets)
-        return loss
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        of_weights, offsets = ctx.saved_tensors
-        counts = offsets[1:] - offsets[:-1]
-        return of_weights * grad.repeat_interleave(counts, output_size=len(of_weights)), None, None, None
-
-
 def distortion(weights: Tensor, samples: Samples) -> Tensor:
-    """Compute `nerfloom.kernels.compositing.density.distortion`, with the weights' gradient.
-
-    `weights` and `samples` are as there.
-    """
-    inputs = (tensor.contiguous() for tensor in (weights, samples.t_starts, samples.t_ends, samples.offsets))
-    return _Distortion.apply(*inputs)
+    """Compute `density.distortion` of `weights` and `samples`, with the gradient of the weights."""
+    inputs = [tensor.contiguous() for tensor in (weights, samples.t_starts, samples.t_ends, samples.offsets)]
+    weights, _, _, offsets = inputs
+    loss, of_weights = weights.new_empty(samples.num_rays), torch.empty_like(weights)
+    launch(_distortion, (samples.num_rays,), *inputs, loss, of_weights, BLOCK=BLOCK, num_warps=1)
+    return _Distortion.apply((loss, of_weights), offsets, weights)

@@ -16,7 +16,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.kernels.encodings.harmonics_triton import harmonics
-from nerfloom.kernels.triton_launch import MAX_FLOAT, blocks, launch
+from nerfloom.kernels.triton_launch import MAX_FLOAT, blocks, launch, load_three, own_rows, store_three
 
 BLOCK = 256
 """Rows, or values, per program."""
@@ -24,21 +24,15 @@ BLOCK = 256
 
 @triton.jit(do_not_specialize=["count"])
 def _harmonics(directions, out, count, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
-    x = tl.load(directions + n * 3, mask=here, other=0.0)
-    y = tl.load(directions + n * 3 + 1, mask=here, other=0.0)
-    z = tl.load(directions + n * 3 + 2, mask=here, other=0.0)
+    n, here = own_rows(count, BLOCK)
+    x, y, z = load_three(directions + n * 3, here)
     tl.store(out + n * WIDTH, tl.full([BLOCK], 0.28209479177387814, tl.float32), mask=here)
     for k in tl.static_range(1, WIDTH):
         tl.store(out + n * WIDTH + k, harmonics(x, y, z, k), mask=here)
 
 
 def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
-    """Compute `nerfloom.kernels.encodings.spherical_harmonics.spherical_harmonics`, without derivatives.
-
-    `directions` and `levels` are as there.
-    """
+    """Compute `spherical_harmonics.spherical_harmonics` of `directions` and `levels`, without derivatives."""
     directions, count = directions.contiguous(), len(directions)
     out = directions.new_empty(count, levels**2)
     launch(_harmonics, (blocks(count, BLOCK),), directions, out, count, WIDTH=levels**2, BLOCK=BLOCK)
@@ -47,8 +41,7 @@ def spherical_harmonics(directions: Tensor, levels: int = 4) -> Tensor:
 
 @triton.jit(do_not_specialize=["count"])
 def _waves(x, out, count, dims, first, width, BLOCK: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)  # a value of the result
-    here = i < count
+    i, here = own_rows(count, BLOCK)  # a value of the result
     n, column = i // width, i % width
     wave = tl.maximum(column - first, 0)
     k, part = wave // (2 * dims), wave % (2 * dims)
@@ -62,8 +55,7 @@ def _waves(x, out, count, dims, first, width, BLOCK: tl.constexpr):
 
 @triton.jit(do_not_specialize=["count"])
 def _waves_backward(rows, grad, of_x, count, dims, first, width, num_frequencies, BLOCK: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)  # a value of the input
-    here = i < count
+    i, here = own_rows(count, BLOCK)  # a value of the input
     n, d = i // dims, i % dims
     total = tl.load(grad + n * width + d, mask=here & (d < first), other=0.0)
     at, scale = n * width + first + d, 1.0
@@ -100,10 +92,7 @@ class _Frequency(torch.autograd.Function):
 
 
 def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
-    """Compute `nerfloom.kernels.encodings.frequency.frequency_encoding`, with first derivatives.
-
-    `x`, `num_frequencies` and `include_input` are as there.
-    """
+    """Compute `frequency.frequency_encoding` of `x`, `num_frequencies` and `include_input`, with first derivatives."""
     rows = x.flatten(0, -2).contiguous()
     return _Frequency.apply(rows, num_frequencies, include_input).unflatten(0, x.shape[:-1])
 
@@ -136,30 +125,25 @@ def _contracted(positions, centre, scale, n, here):
 
 @triton.jit(do_not_specialize=["count"])
 def _contract(positions, centre, scale, out, count, BLOCK: tl.constexpr):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     x, y, z, _, _, factor = _contracted(positions, centre, scale, n, here)
-    tl.store(out + n * 3, 0.25 * x * factor + 0.5, mask=here)
-    tl.store(out + n * 3 + 1, 0.25 * y * factor + 0.5, mask=here)
-    tl.store(out + n * 3 + 2, 0.25 * z * factor + 0.5, mask=here)
+    store_three(out + n * 3, 0.25 * x * factor + 0.5, 0.25 * y * factor + 0.5, 0.25 * z * factor + 0.5, here)
 
 
 @triton.jit(do_not_specialize=["count"])
 def _contract_backward(positions, centre, scale, grad, out, count, BLOCK: tl.constexpr):
     # With n = max(1, |x|) and y = x s(n), s(n) = 2/n - 1/n^2:  J^T g = s g + x (x . g) s'(n) / n. The second term is 0
     # if n is 1.
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     x, y, z, unit, norm, factor = _contracted(positions, centre, scale, n, here)
-    of_x = tl.load(grad + n * 3, mask=here, other=0.0)
-    of_y = tl.load(grad + n * 3 + 1, mask=here, other=0.0)
-    of_z = tl.load(grad + n * 3 + 2, mask=here, other=0.0)
+    of_x, of_y, of_z = load_three(grad + n * 3, here)
     along = (x * of_x + y * of_y + z * of_z) / norm
     radial = along * ((2 * unit / norm - 2) / norm / norm)
     over = 0.25 * unit
-    tl.store(out + n * 3, over * tl.load(scale) * (factor * of_x + radial * x), mask=here)
-    tl.store(out + n * 3 + 1, over * tl.load(scale + 1) * (factor * of_y + radial * y), mask=here)
-    tl.store(out + n * 3 + 2, over * tl.load(scale + 2) * (factor * of_z + radial * z), mask=here)
+    x = over * tl.load(scale) * (factor * of_x + radial * x)
+    y = over * tl.load(scale + 1) * (factor * of_y + radial * y)
+    z = over * tl.load(scale + 2) * (factor * of_z + radial * z)
+    store_three(out + n * 3, x, y, z, here)
 
 
 class _Contract(torch.autograd.Function):
@@ -181,8 +165,5 @@ class _Contract(torch.autograd.Function):
 
 
 def contract_to_unit(positions: Tensor, box: Tensor) -> Tensor:
-    """Compute `nerfloom.kernels.encodings.contraction.contract_to_unit`, with the gradient of the positions.
-
-    `positions` and `box` are as there.
-    """
+    """Compute `contraction.contract_to_unit` of `positions` and `box`, with the gradient of the positions."""
     return _Contract.apply(positions.contiguous(), box)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nerfloom.kernels import native, result_cache
 from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.math import at_least_float32
 from nerfloom.kernels.triton_backend import later
 
 MAX_FREQUENCIES = 32
@@ -19,20 +20,12 @@ _backward = native.Function("frequency_encoding_backward", "ppqiiipi")
 
 
 def frequency_encoding_reference(x: Tensor, num_frequencies: int, include_input: bool = True) -> Tensor:
-    """Compute `frequency_encoding` in PyTorch, on any device.
-
-    `x`, `num_frequencies` and `include_input` are as in `frequency_encoding`.
-    """
-    x = _widened(x)
+    """Compute `frequency_encoding` of `x`, `num_frequencies` and `include_input` in PyTorch, on any device."""
+    x = at_least_float32(x)
     scales = 2.0 ** torch.arange(num_frequencies, device=x.device, dtype=x.dtype)
     angles = x[..., None, :] * scales[:, None]
     waves = torch.stack([angles.sin(), angles.cos()], dim=-2).flatten(-3)
     return torch.cat([x, waves], dim=-1) if include_input else waves
-
-
-def _widened(x: Tensor) -> Tensor:
-    """Convert types other than float64 to float32: in half precision 2^9 x overflows from x = 128 on."""
-    return x if x.dtype == torch.float64 else x.float()
 
 
 class _FrequencyEncoding(torch.autograd.Function):
@@ -83,7 +76,7 @@ def frequency_encoding(x: Tensor, num_frequencies: int, include_input: bool = Tr
     """
     if not 0 <= num_frequencies <= MAX_FREQUENCIES:
         raise ValueError(f"a frequency encoding has 0 to {MAX_FREQUENCIES} frequencies, not {num_frequencies}")
-    x = _widened(x)
+    x = at_least_float32(x)  # in half precision 2^9 x overflows from x = 128 on
     return FREQUENCY_ENCODING((x,), x, num_frequencies, include_input)
 
 

@@ -127,8 +127,10 @@ class _DirectionalEncoding(torch.autograd.Function):
 
         def compute() -> Tensor:
             out = directions.new_empty(count, num_features(bands))
-            addresses = native.pointer(directions, "directions", (count, 3)), _roughness(roughness, count)
-            _forward(*addresses, count, bands, out.data_ptr(), native.threads())
+            _forward(
+                native.pointer(directions, "directions", (count, 3)), native.pointer(roughness, "roughness", (count,)),
+                count, bands, out.data_ptr(), native.threads(),
+            )  # fmt: skip
             return out
 
         ctx.save_for_backward(directions, roughness)
@@ -144,10 +146,6 @@ class _DirectionalEncoding(torch.autograd.Function):
         given = directions.data_ptr(), roughness.data_ptr()
         _backward(*given, count, ctx.bands, address, *(out.data_ptr() for out in outs), native.threads())
         return *outs, None
-
-
-def _roughness(roughness: Tensor, count: int) -> int:
-    return native.pointer(roughness, "roughness", (count,))
 
 
 DIRECTIONAL_ENCODING.implementation(TRITON)(later("encodings.integrated_directional_triton", "directional_encoding"))

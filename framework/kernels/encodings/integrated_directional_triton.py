@@ -17,7 +17,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.kernels.encodings.integrated_directional import MAX_BANDS, degrees, num_features
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, own_rows, store_three
 
 BLOCK = 128
 """Directions per program."""
@@ -25,11 +25,8 @@ BLOCK = 128
 
 @triton.jit(do_not_specialize=["count"])
 def _forward(directions, roughness, out, count, WIDTH: tl.constexpr, LAST: tl.constexpr, BLOCK: tl.constexpr):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
-    x = tl.load(directions + n * 3, mask=here, other=0.0)
-    y = tl.load(directions + n * 3 + 1, mask=here, other=0.0)
-    z = tl.load(directions + n * 3 + 2, mask=here, other=0.0)
+    n, here = own_rows(count, BLOCK)
+    x, y, z = load_three(directions + n * 3, here)
     rough = tl.load(roughness + n, mask=here, other=0.0)
     to = out + n * WIDTH
     real = tl.full([BLOCK], 0.28209479177387814, tl.float32)  # P_m^m times the power m of x + i y
@@ -60,11 +57,8 @@ def _backward(
     directions, roughness, grad, of_directions, of_roughness, count, WIDTH: tl.constexpr, LAST: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
-    x = tl.load(directions + n * 3, mask=here, other=0.0)
-    y = tl.load(directions + n * 3 + 1, mask=here, other=0.0)
-    z = tl.load(directions + n * 3 + 2, mask=here, other=0.0)
+    n, here = own_rows(count, BLOCK)
+    x, y, z = load_three(directions + n * 3, here)
     rough = tl.load(roughness + n, mask=here, other=0.0)
     given = grad + n * WIDTH
     of_x = tl.zeros([BLOCK], tl.float32)
@@ -106,9 +100,7 @@ def _backward(
                     of_rough += rate * kept * row * along
                     of_x += kept * row * (by_real * slope_real + by_imaginary * slope_imaginary)
                     of_y += kept * row * (by_imaginary * slope_real - by_real * slope_imaginary)
-    tl.store(of_directions + n * 3, of_x, mask=here)
-    tl.store(of_directions + n * 3 + 1, of_y, mask=here)
-    tl.store(of_directions + n * 3 + 2, of_z, mask=here)
+    store_three(of_directions + n * 3, of_x, of_y, of_z, here)
     tl.store(of_roughness + n, of_rough, mask=here)
 
 
@@ -134,9 +126,6 @@ class _DirectionalEncoding(torch.autograd.Function):
 
 
 def directional_encoding(directions: Tensor, roughness: Tensor, bands: int = MAX_BANDS) -> Tensor:
-    """Compute `nerfloom.kernels.encodings.integrated_directional.directional_encoding`, with first derivatives.
-
-    `directions`, `roughness` and `bands` are as there.
-    """
+    """Compute `directional_encoding` of `directions`, `roughness` and `bands`, with first derivatives."""
     found: Tensor = _DirectionalEncoding.apply(directions.contiguous(), roughness.contiguous(), bands)
     return found

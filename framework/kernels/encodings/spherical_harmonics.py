@@ -144,11 +144,9 @@ def _products(levels: int, dtype: torch.dtype, device: torch.device) -> _Product
     return _Products(*indices, *(torch.tensor(each, dtype=dtype, device=device) for each in (constants, factors)))
 
 
-def _fits(directions: Tensor, levels: int = 4) -> bool:
-    return levels > 1
-
-
-@SPHERICAL_HARMONICS.implementation(FEW_OPERATIONS, types=None, order=torch.inf, fits=_fits)
+@SPHERICAL_HARMONICS.implementation(
+    FEW_OPERATIONS, types=None, order=torch.inf, fits=lambda directions, levels=4: levels > 1
+)
 def _as_product(directions: Tensor, levels: int = 4) -> Tensor:
     """Compute `spherical_harmonics` as one matrix product, for any device and float type."""
     known = _products(levels, directions.dtype, directions.device)

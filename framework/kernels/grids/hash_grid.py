@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerfloom.geometry.limits import between
 from nerfloom.kernels import native
-from nerfloom.kernels.dispatch import FEW_OPERATIONS, TRITON
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import LookUp, TableGradient, fits
 from nerfloom.kernels.triton_backend import later
@@ -65,11 +65,10 @@ def _signed(strides: tuple[int, ...]) -> tuple[int, ...]:
     return tuple((stride + 2**31) % 2**32 - 2**31 for stride in strides)
 
 
-def hash_grid_reference(positions: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
-    """Compute `hash_grid` in PyTorch, for any device and float type, with derivatives of any order.
-
-    `positions`, `table`, `layout` and the result are as in `hash_grid`.
-    """
+def hash_grid_reference(
+    positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None = None
+) -> Tensor:
+    """Compute `hash_grid` of `positions`, `table` and `layout` in PyTorch; `deferred` is not used."""
     features = []
     for level, offset in enumerate(layout.offsets[:-1]):
         entries, weights, _ = corners(positions, layout, level)
@@ -86,10 +85,7 @@ LOOK_UP = LookUp("hash_grid", "positions", ("N", 3), _forward, _backward_table, 
 
 
 def hash_grid(
-    positions: Tensor,
-    table: Tensor,
-    layout: HashGridLayout,
-    deferred: TableGradient | None = None,
+    positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None = None
 ) -> Tensor:
     """Return the multiresolution hash encoding of positions: Instant-NGP, section 3.
 
@@ -112,7 +108,8 @@ def hash_grid(
     return HASH_GRID((positions, table), positions, table, layout, deferred)
 
 
-HASH_GRID = LOOK_UP.operation(hash_grid_reference)
+HASH_GRID: Operation[..., Tensor] = Operation(LOOK_UP.name, hash_grid_reference)
+HASH_GRID.implementation(CPP, fits=fits)(LOOK_UP.compiled)
 HASH_GRID.implementation(TRITON, fits=fits)(later("grids.hash_grid_triton", "hash_grid"))
 
 
@@ -150,13 +147,9 @@ def _levels(layout: HashGridLayout, dtype: torch.dtype, device: torch.device) ->
     )
 
 
-def _has_int32_indices(
-    positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None
-) -> bool:
-    return layout.num_entries < 2**31
-
-
-@HASH_GRID.implementation(FEW_OPERATIONS, types=None, order=torch.inf, fits=_has_int32_indices)
+@HASH_GRID.implementation(  # with indices in 32 bits
+    FEW_OPERATIONS, types=None, order=torch.inf, fits=lambda *given: given[2].num_entries < 2**31
+)
 def _all_levels(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
     """Compute `hash_grid` with one set of operations for all levels, for any device and float type."""
     held = 8 * layout.num_levels * table.shape[1]

@@ -6,7 +6,6 @@ It is defined by its reference and by compiled functions (`LookUp`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
@@ -15,8 +14,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native, result_cache, table_memory
-from nerfloom.kernels.adam.deferred import Parts, waiting
-from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.adam.deferred import DeferredGradient, waiting
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 
 
@@ -79,30 +77,14 @@ class LookUp:
             table = table.detach()
         return _LookedUp.apply(points, table, placeholder, layout, self)
 
-    def operation(
-        self, reference: Callable[[Tensor, Tensor, HashGridLayout], Tensor]
-    ) -> Operation[[Tensor, Tensor, HashGridLayout, TableGradient | None], Tensor]:
-        """Return the operation that chooses between compiled code and the reference, which only supports autograd.
 
-        Args:
-            reference: computes the features of points and table by layout.
-        """
-
-        def undeferred(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
-            return reference(points, table, layout)
-
-        made = Operation(self.name, undeferred)
-        made.implementation(CPP, fits=fits)(self.compiled)
-        return made
-
-
-def fits(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> bool:
+def fits(points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None = None) -> bool:
     """Return whether kernels support the features of `table`; `points`, `layout` and `deferred` do not matter."""
     return table.shape[1] in (1, 2, 4, 8)
 
 
-class TableGradient:
-    """The deferred gradient of a table: gradients of encodings, collected in backward passes and not yet accumulated.
+class TableGradient(DeferredGradient):
+    """The deferred gradient of a table: points (N, ..., D) of encodings, and gradients (N, L * F) of their results.
 
     A step uses few entries. Accumulating the gradient level by level, each followed by Adam, takes one pass over the
     table; autograd's dense gradient takes many.
@@ -113,24 +95,9 @@ class TableGradient:
     """
 
     def __init__(self, look_up: LookUp, layout: HashGridLayout) -> None:
+        super().__init__()
         self.look_up, self.layout = look_up, layout
-        self.parts: Parts = []
-        """Points (N, ..., D) of each encoding, and gradient (N, L * F), for each of its results."""
         self._sum: Tensor | None = None
-
-    @property
-    def pending(self) -> bool:
-        """True if there is a gradient."""
-        return bool(self.parts)
-
-    def clear(self) -> None:
-        """Discard the gradient."""
-        self.parts.clear()
-
-    @property
-    def gradients(self) -> list[Tensor]:
-        """The collected gradients (N, L * F) of encodings."""
-        return [grad for _, grad in self.parts]
 
     def _arguments(self, features: int) -> tuple[Any, ...]:
         width, layout = self.layout.num_levels * features, (*self.layout.arrays, self.layout.num_levels)
@@ -149,10 +116,6 @@ class TableGradient:
         self.parts.clear()
 
     def summed(self, table: Tensor) -> Tensor:
-        """Return the accumulated gradient (E, F) of `table` and discard it.
-
-        The result's memory is reused: its entries must be zero before the next call, as Adam leaves them.
-        """
         if self._sum is None:
             self._sum = table_memory.table(*table.shape)
         self.add_to(self._sum)
@@ -162,10 +125,6 @@ class TableGradient:
         self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
         rate: float, betas: tuple[float, float], eps: float,
     ) -> int:  # fmt: skip
-        """Update `table` (E, F) by `kernels.adam.adam.sparse_adam` with this gradient, and discard the gradient.
-
-        `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
-        """
         shape = (self.layout.num_entries, table.shape[1])
         table, mean, square, seen = (values[: shape[0]] for values in (table, mean, square, seen))
         updated: int = self.look_up.adam(

@@ -14,7 +14,7 @@ from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.grids.hash_grid import hash_grid_reference
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
-from nerfloom.kernels.grids.hash_grid_lookup import LookUp
+from nerfloom.kernels.grids.hash_grid_lookup import LookUp, fits
 
 _forward = native.Function("hash_grid_tangent_forward", "pqpippipi")
 _backward_table = native.Function("hash_grid_tangent_backward_table", "pppiippipi")
@@ -24,10 +24,7 @@ LOOK_UP = LookUp("hash_grid_tangent", "points", ("N", 6), _forward, _backward_ta
 
 
 def hash_grid_tangent_reference(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
-    """Compute `hash_grid_tangent` in PyTorch, for any device and float type, with derivatives of any order.
-
-    `points`, `table`, `layout` and the result are as there.
-    """
+    """Compute `hash_grid_tangent` of `points`, `table` and `layout` in PyTorch, with derivatives of any order."""
     # The gradient of weighted features is linear in the weights: its derivatives by them, along a direction, are the
     # derivatives of the features. The first use of PyTorch's forward mode would load decompositions, which takes
     # seconds.
@@ -65,11 +62,7 @@ def hash_grid_tangent(points: Tensor, table: Tensor, layout: HashGridLayout) -> 
 HASH_GRID_TANGENT = Operation("hash_grid_tangent", hash_grid_tangent_reference)
 
 
-def _fits(points: Tensor, table: Tensor, layout: HashGridLayout) -> bool:
-    return table.shape[1] in (1, 2, 4, 8)
-
-
-@HASH_GRID_TANGENT.implementation(CPP, order=0, differentiable=0, fits=_fits)
+@HASH_GRID_TANGENT.implementation(CPP, order=0, differentiable=0, fits=fits)
 def _compiled(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
     points, table = points.contiguous(), table.contiguous()
     features = table.shape[1]

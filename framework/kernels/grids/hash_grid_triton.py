@@ -20,7 +20,7 @@ from torch import Tensor
 
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, own_rows, store_three
 
 BLOCK = 128
 """Positions per program."""
@@ -38,6 +38,13 @@ def _levels(layout: HashGridLayout, device: torch.device) -> Tensor:
 
 
 @triton.jit
+def _level(levels, level):
+    """Return a level's resolution, first entry, hash mask, and 1 if it is dense (otherwise 0)."""
+    row = levels + level * 4
+    return tl.load(row).to(tl.int32), tl.load(row + 1), tl.load(row + 2), tl.load(row + 3)
+
+
+@triton.jit
 def _along(positions, n, here, axis: tl.constexpr, resolution):
     """Return the cell along an axis, the position in it in [0, 1], and the derivative of the latter."""
     x = tl.load(positions + n * 3 + axis, mask=here, other=0.0)
@@ -45,6 +52,15 @@ def _along(positions, n, here, axis: tl.constexpr, resolution):
     cell = tl.minimum(tl.where(scaled == scaled, scaled, 0.0).to(tl.int32), resolution - 1)
     inside = tl.where((x < 0) | (x > 1), 0.0, resolution.to(tl.float32))
     return cell, scaled - cell.to(tl.float32), inside
+
+
+@triton.jit
+def _place(positions, n, here, resolution):
+    """Return the cell along each axis, the position in it along each, and the derivatives of the latter."""
+    x, u, inside_x = _along(positions, n, here, 0, resolution)
+    y, v, inside_y = _along(positions, n, here, 1, resolution)
+    z, w, inside_z = _along(positions, n, here, 2, resolution)
+    return x, y, z, u, v, w, inside_x, inside_y, inside_z
 
 
 @triton.jit
@@ -67,16 +83,11 @@ def _entry(x, y, z, corner: tl.constexpr, resolution, mask, dense):
 
 @triton.jit(do_not_specialize=["count"])
 def _forward(positions, table, levels, out, count, num_levels, F: tl.constexpr, BLOCK: tl.constexpr):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    n, here = own_rows(count, BLOCK)
     level = tl.program_id(1)
-    here = n < count
     f = tl.arange(0, F)
-    resolution = tl.load(levels + level * 4).to(tl.int32)
-    first, mask = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2)
-    dense = tl.load(levels + level * 4 + 3)
-    x, u, _ = _along(positions, n, here, 0, resolution)
-    y, v, _ = _along(positions, n, here, 1, resolution)
-    z, w, _ = _along(positions, n, here, 2, resolution)
+    resolution, first, mask, dense = _level(levels, level)
+    x, y, z, u, v, w, _, _, _ = _place(positions, n, here, resolution)
     total = tl.zeros([BLOCK, F], tl.float32)
     for corner in tl.static_range(8):
         weight = _end(u, corner >> 2 & 1) * _end(v, corner >> 1 & 1) * _end(w, corner & 1)
@@ -89,16 +100,11 @@ def _forward(positions, table, levels, out, count, num_levels, F: tl.constexpr, 
 
 @triton.jit(do_not_specialize=["count"])
 def _backward_table(positions, grad, levels, of_table, count, num_levels, F: tl.constexpr, BLOCK: tl.constexpr):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    n, here = own_rows(count, BLOCK)
     level = tl.program_id(1)
-    here = n < count
     f = tl.arange(0, F)
-    resolution = tl.load(levels + level * 4).to(tl.int32)
-    first, mask = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2)
-    dense = tl.load(levels + level * 4 + 3)
-    x, u, _ = _along(positions, n, here, 0, resolution)
-    y, v, _ = _along(positions, n, here, 1, resolution)
-    z, w, _ = _along(positions, n, here, 2, resolution)
+    resolution, first, mask, dense = _level(levels, level)
+    x, y, z, u, v, w, _, _, _ = _place(positions, n, here, resolution)
     g = tl.load(grad + (n[:, None] * num_levels + level) * F + f[None, :], mask=here[:, None], other=0.0)
     some = here[:, None] & (g != 0)  # hidden samples have no gradient and need no writing
     for corner in tl.static_range(8):
@@ -111,19 +117,14 @@ def _backward_table(positions, grad, levels, of_table, count, num_levels, F: tl.
 def _backward_positions(
     positions, table, grad, levels, of_positions, count, num_levels, F: tl.constexpr, BLOCK: tl.constexpr
 ):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     f = tl.arange(0, F)
     of_x = tl.zeros([BLOCK], tl.float32)
     of_y = tl.zeros([BLOCK], tl.float32)
     of_z = tl.zeros([BLOCK], tl.float32)
     for level in range(num_levels):
-        resolution = tl.load(levels + level * 4).to(tl.int32)
-        first, mask = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2)
-        dense = tl.load(levels + level * 4 + 3)
-        x, u, inside_x = _along(positions, n, here, 0, resolution)
-        y, v, inside_y = _along(positions, n, here, 1, resolution)
-        z, w, inside_z = _along(positions, n, here, 2, resolution)
+        resolution, first, mask, dense = _level(levels, level)
+        x, y, z, u, v, w, inside_x, inside_y, inside_z = _place(positions, n, here, resolution)
         g = tl.load(grad + (n[:, None] * num_levels + level) * F + f[None, :], mask=here[:, None], other=0.0)
         for corner in tl.static_range(8):
             entry = first + _entry(x, y, z, corner, resolution, mask, dense)
@@ -133,9 +134,7 @@ def _backward_positions(
             of_x += (2 * (corner >> 2 & 1) - 1) * inside_x * along_y * along_z * value
             of_y += (2 * (corner >> 1 & 1) - 1) * inside_y * along_x * along_z * value
             of_z += (2 * (corner & 1) - 1) * inside_z * along_x * along_y * value
-    tl.store(of_positions + n * 3, of_x, mask=here)
-    tl.store(of_positions + n * 3 + 1, of_y, mask=here)
-    tl.store(of_positions + n * 3 + 2, of_z, mask=here)
+    store_three(of_positions + n * 3, of_x, of_y, of_z, here)
 
 
 class _HashGrid(torch.autograd.Function):
@@ -170,10 +169,5 @@ class _HashGrid(torch.autograd.Function):
 
 
 def hash_grid(positions: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None) -> Tensor:
-    """Compute `nerfloom.kernels.grids.hash_grid.hash_grid`, with first derivatives, for 1, 2, 4 or 8 features.
-
-    Autograd accumulates the gradient of the table: `deferred` is not used.
-
-    `positions`, `table` and `layout` are as there.
-    """
+    """Compute `hash_grid` of `positions`, `table` and `layout`; autograd has the gradient instead of `deferred`."""
     return _HashGrid.apply(positions.contiguous(), table.contiguous(), layout)

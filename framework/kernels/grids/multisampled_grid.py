@@ -15,18 +15,17 @@ import torch
 from torch import Tensor
 
 from nerfloom.kernels import native
-from nerfloom.kernels.dispatch import FEW_OPERATIONS
+from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, Operation
 from nerfloom.kernels.grids.downweighting import level_weights
 from nerfloom.kernels.grids.hash_grid import corners, hash_grid
 from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
-from nerfloom.kernels.grids.hash_grid_lookup import LookUp, TableGradient
+from nerfloom.kernels.grids.hash_grid_lookup import LookUp, TableGradient, fits
 
 
-def multisampled_grid_reference(points: Tensor, table: Tensor, layout: HashGridLayout) -> Tensor:
-    """Compute `multisampled_grid` in PyTorch, for any device and float type, with derivatives of any order.
-
-    `points`, `table`, `layout` and the result are as in `multisampled_grid`.
-    """
+def multisampled_grid_reference(
+    points: Tensor, table: Tensor, layout: HashGridLayout, deferred: TableGradient | None = None
+) -> Tensor:
+    """Compute `multisampled_grid` of `points`, `table` and `layout` in PyTorch; `deferred` is not used."""
     positions, deviations = points[..., :3].flatten(0, 1), points[..., 3].detach().flatten()
     shares = level_weights(deviations, _resolutions(layout, points.dtype, points.device)).to(table.dtype)
     features = []
@@ -76,7 +75,8 @@ def multisampled_grid(
     return MULTISAMPLED_GRID((points, table), points, table, layout, deferred)
 
 
-MULTISAMPLED_GRID = LOOK_UP.operation(multisampled_grid_reference)
+MULTISAMPLED_GRID: Operation[..., Tensor] = Operation(LOOK_UP.name, multisampled_grid_reference)
+MULTISAMPLED_GRID.implementation(CPP, fits=fits)(LOOK_UP.compiled)
 
 
 @MULTISAMPLED_GRID.implementation(FEW_OPERATIONS, types=None, order=torch.inf)

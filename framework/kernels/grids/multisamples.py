@@ -18,10 +18,7 @@ from nerfloom.kernels.dispatch import CPP, Operation
 
 
 def unit_multisamples_reference(frustums: Frustums, pattern: Pattern, box: Tensor, contracted: bool) -> Tensor:
-    """Compute `unit_multisamples` in PyTorch, on any device and for any float type.
-
-    `frustums`, `pattern`, `box` and `contracted` are as in `unit_multisamples`.
-    """
+    """Compute `unit_multisamples` of `frustums`, `pattern`, `box` and `contracted` in PyTorch, for any float type."""
     return unit_balls(*multisamples(frustums, pattern), box, contracted)
 
 
@@ -158,14 +155,9 @@ class _InCube(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        origins: Tensor,
-        directions: Tensor,
-        columns: tuple[Tensor, ...],
-        row: tuple[int, ...],
-        to_cube: _Map,
+        ctx: Any, origins: Tensor, directions: Tensor, columns: tuple[Tensor, ...], row: tuple[int, ...], to_cube: _Map,
         kernels: tuple[native.Function, native.Function],
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         count, tensors = len(origins), [x.contiguous() for x in (origins, directions, *columns)]
         out = origins.new_empty(count, *row)
         kernels[0](

@@ -185,12 +185,6 @@ def band_variation(
 ) -> Tensor:
     """Return the total variation (K,) of consecutive rows of K factors, as `variation` of `plane_bands`.
 
-    The compiled form has first derivatives only.
-
-    Args:
-        table: (E, F) entries of all factors.
-        layout: axes, resolutions and offsets of the factors.
-        bands: group, factor in the group, first row and number of rows of each band.
-        deferred: collects the gradient of the table in the compiled form instead of autograd; None for autograd.
+    The compiled form has first derivatives only. `table`, `layout`, `bands` and `deferred` are as in `plane_bands`.
     """
     return BAND_VARIATION((table,), table, _shapes(layout, bands), deferred)

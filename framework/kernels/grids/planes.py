@@ -17,8 +17,7 @@ from torch import Tensor
 
 from nerfloom.geometry.limits import between
 from nerfloom.kernels import native, result_cache, table_memory
-from nerfloom.kernels.adam.adam import sparse_adam
-from nerfloom.kernels.adam.deferred import Parts, waiting
+from nerfloom.kernels.adam.deferred import DeferredGradient, waiting
 from nerfloom.kernels.dispatch import CPP, FEW_OPERATIONS, TRITON, Operation
 from nerfloom.kernels.grids.plane_bands import Shape, add_variation_gradient
 from nerfloom.kernels.grids.planes_layout import PlanesLayout
@@ -28,11 +27,10 @@ MAX_HELD = 2**26
 """Maximum number of corner features held at once in the form with few operations; it processes positions in parts."""
 
 
-def planes_reference(positions: Tensor, table: Tensor, layout: PlanesLayout) -> Tensor:
-    """Compute `planes` in PyTorch, on any device and for any float type, with derivatives of any order.
-
-    `positions`, `table`, `layout` and the result are as in `planes`.
-    """
+def planes_reference(
+    positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None = None
+) -> Tensor:
+    """Compute `planes` of `positions`, `table` and `layout` in PyTorch; `deferred` is not used."""
     clamped, features = between(positions, 0.0, 1.0), []
     for group, resolution in enumerate(layout.resolutions):
         vertices = torch.tensor(resolution, device=positions.device)
@@ -63,8 +61,8 @@ _backward_table = native.Function("planes_backward_table", "pqp" + _TAIL + "ppi"
 _backward_positions = native.Function("planes_backward_positions", "pqp" + _TAIL + "ppi")
 
 
-class PlanesGradient:
-    """The deferred gradient of a table: gradients of look-ups, collected in backward passes and not yet accumulated.
+class PlanesGradient(DeferredGradient):
+    """The deferred gradient of a table: positions (N, D) of look-ups, and gradients (N, G * F) of their results.
 
     A step uses few entries. The gradient is accumulated in a table kept between steps; Adam resets the used entries to
     zero.
@@ -74,9 +72,8 @@ class PlanesGradient:
     """
 
     def __init__(self, layout: PlanesLayout) -> None:
+        super().__init__()
         self.layout = layout
-        self.parts: Parts = []
-        """Positions (N, D) of each look-up, and gradient (N, G * F) of its result."""
         self.bands: list[tuple[int, Tensor]] = []
         """Index of the first entry, and gradient (B, F), of each band of entries read by `plane_bands`."""
         self.variations: list[tuple[tuple[Shape, ...], Tensor]] = []
@@ -85,17 +82,14 @@ class PlanesGradient:
 
     @property
     def gradients(self) -> list[Tensor]:
-        """The collected gradients of look-ups, of bands and of their variation."""
         return [grad for _, grad in (*self.parts, *self.bands, *self.variations)]
 
     @property
     def pending(self) -> bool:
-        """True if there is a gradient."""
         return bool(self.parts or self.bands or self.variations)
 
     def clear(self) -> None:
-        """Discard the gradient."""
-        self.parts.clear()
+        super().clear()
         self.bands.clear()
         self.variations.clear()
 
@@ -104,21 +98,7 @@ class PlanesGradient:
         self.clear()
         self.layout, self._sum = layout, None
 
-    def adam(
-        self, table: Tensor, mean: Tensor, square: Tensor, seen: Tensor,
-        rate: float, betas: tuple[float, float], eps: float,
-    ) -> int | Tensor:  # fmt: skip
-        """Update `table` (E, F) by `kernels.adam.adam.sparse_adam` with this gradient, and discard the gradient.
-
-        `mean`, `square`, `seen`, `rate`, `betas`, `eps` and the result are as in `sparse_adam`.
-        """
-        return sparse_adam(table, self.summed(table), mean, square, seen, rate, betas, eps)
-
     def summed(self, table: Tensor) -> Tensor:
-        """Return the accumulated gradient (E, F) of `table` and discard it.
-
-        The result's memory is reused: its entries must be zero before the next call, as Adam leaves them.
-        """
         if self._sum is None:
             self._sum = table_memory.table(*table.shape)
         end = self.layout.num_entries
@@ -136,13 +116,7 @@ class _Planes(torch.autograd.Function):
     """The compiled form of `planes`."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        positions: Tensor,
-        table: Tensor,
-        placeholder: Tensor | None,
-        layout: PlanesLayout,
-    ) -> Tensor:
+    def forward(ctx: Any, positions: Tensor, table: Tensor, placeholder: Tensor | None, layout: PlanesLayout) -> Tensor:
         def compute() -> Tensor:
             out = positions.new_empty(len(positions), layout.num_groups * table.shape[1])
             _forward(*_arguments(positions, table, layout), out.data_ptr(), native.threads())
@@ -187,12 +161,7 @@ def _arguments(positions: Tensor, table: Tensor, layout: PlanesLayout) -> tuple[
     return points, count, entries, *sizes, *layout.arrays
 
 
-def planes(
-    positions: Tensor,
-    table: Tensor,
-    layout: PlanesLayout,
-    deferred: PlanesGradient | None = None,
-) -> Tensor:
+def planes(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None = None) -> Tensor:
     """Return the factorised features at positions: K-Planes, section 3, and TensoRF, section 4.
 
     The compiled form has first derivatives only.
@@ -217,11 +186,7 @@ def planes(
     return PLANES((positions, table), positions, table, layout, deferred)
 
 
-def _reference(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None) -> Tensor:
-    return planes_reference(positions, table, layout)
-
-
-PLANES = Operation("planes", _reference)
+PLANES: Operation[..., Tensor] = Operation("planes", planes_reference)
 
 
 @PLANES.implementation(CPP)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from nerfloom.kernels.grids.planes import PlanesGradient
 from nerfloom.kernels.grids.planes_layout import PlanesLayout
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, own_rows
 
 BLOCK = 32
 """Positions per program."""
@@ -75,10 +75,9 @@ def _value(positions, table, factor, n, f, dims, features, mask, here):
 def _forward(
     positions, table, factors, out, count, dims, features, groups, P: tl.constexpr, F: tl.constexpr, BLOCK: tl.constexpr
 ):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    n, here = own_rows(count, BLOCK)
     group = tl.program_id(1)
     f = tl.arange(0, F)
-    here = n < count
     mask = here[:, None] & (f < features)[None, :]
     product = tl.full([BLOCK, F], 1.0, tl.float32)
     for p in range(P):
@@ -102,10 +101,9 @@ def _backward_table(
     positions, table, grad, factors, of_table, count, dims, features, groups, P: tl.constexpr, F: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    n, here = own_rows(count, BLOCK)
     group = tl.program_id(1)
     f = tl.arange(0, F)
-    here = n < count
     mask = here[:, None] & (f < features)[None, :]
     g = tl.load(grad + (n[:, None] * groups + group) * features + f[None, :], mask=mask, other=0.0)
     mask &= g != 0  # hidden samples have no gradient and need no reading
@@ -128,9 +126,8 @@ def _backward_positions(
     positions, table, grad, factors, of_positions, count, dims, features, groups, P: tl.constexpr, F: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    n, here = own_rows(count, BLOCK)
     f, axes = tl.arange(0, F), tl.arange(0, 4)
-    here = n < count
     mask = here[:, None] & (f < features)[None, :]
     total = tl.zeros([BLOCK, 4], tl.float32)
     for group in range(groups):
@@ -185,10 +182,5 @@ class _Planes(torch.autograd.Function):
 
 
 def planes(positions: Tensor, table: Tensor, layout: PlanesLayout, deferred: PlanesGradient | None) -> Tensor:
-    """Compute `nerfloom.kernels.grids.planes.planes`, with first derivatives.
-
-    Autograd accumulates the gradient of the table: `deferred` is not used.
-
-    `positions`, `table` and `layout` are as there.
-    """
+    """Compute `planes.planes` of `positions`, `table` and `layout`; autograd has the gradient instead of `deferred`."""
     return _Planes.apply(positions.contiguous(), table.contiguous(), layout)

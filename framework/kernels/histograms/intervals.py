@@ -13,6 +13,7 @@ from torch import Tensor
 from nerfloom.kernels import native
 from nerfloom.kernels.compositing.density import exclusive_cumsum, optical_depth
 from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.known_gradient import KnownGradient
 from nerfloom.kernels.triton_backend import later
 
 EPS = 1e-7
@@ -85,10 +86,7 @@ class _Weights(torch.autograd.Function):
 def resample_reference(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
 ) -> Tensor:
-    """Compute `resample` in PyTorch, on any device and for any float type.
-
-    `edges`, `weights`, `shift`, `count`, `power` and `padding` are as in `resample`.
-    """
+    """Compute `resample` of `edges`, `weights`, `shift`, `count`, `power` and `padding` in PyTorch."""
     heavy = weights.to(torch.promote_types(weights.dtype, edges.dtype)) ** power + padding
     cdf = torch.cat([torch.zeros_like(heavy[:, :1]), heavy.cumsum(-1)], dim=-1)
     steps = torch.arange(count + 1, device=edges.device)
@@ -121,13 +119,7 @@ def resample(
 RESAMPLE = Operation("resample", resample_reference)
 
 
-def _power_is_known(
-    edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
-) -> bool:
-    return not isinstance(power, Tensor)
-
-
-@RESAMPLE.implementation(CPP, fits=_power_is_known)
+@RESAMPLE.implementation(CPP, fits=lambda edges, weights, shift, count, power, padding: not isinstance(power, Tensor))
 def _resample(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
 ) -> Tensor:
@@ -151,10 +143,7 @@ _resample_intervals = native.Function("resample_intervals", "pppqqqffpi")
 
 
 def proposal_excess_reference(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-    """Compute `proposal_excess` in PyTorch from all pairs of intervals, for any float type.
-
-    `edges`, `weights`, `proposed` and `proposed_weights` are as in `proposal_excess`.
-    """
+    """Compute `proposal_excess` of `edges`, `weights`, `proposed` and `proposed_weights` from pairs of intervals."""
     touches = (proposed[:, None, :-1] <= edges[:, 1:, None]) & (proposed[:, None, 1:] >= edges[:, :-1, None])
     bound = (touches * proposed_weights[:, None, :]).sum(-1)
     return ((weights - bound).clamp(min=0).square() / (weights + EPS)).sum(-1)
@@ -179,31 +168,20 @@ PROPOSAL_EXCESS = Operation("proposal_excess", proposal_excess_reference)
 
 @PROPOSAL_EXCESS.implementation(CPP)
 def _proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-    return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)))
+    inputs = (tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights))
+    edges, weights, proposed, proposed_weights = inputs
+    (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
+    loss, gradient = weights.new_empty(rays), torch.empty_like(proposed_weights)
+    _excess(
+        native.pointer(edges, "edges", (rays, bins + 1)), native.pointer(weights, "weights", (rays, bins)), bins,
+        native.pointer(proposed, "proposed edges", (rays, proposed_bins + 1)),
+        native.pointer(proposed_weights, "proposed weights", (rays, proposed_bins)), proposed_bins, rays, EPS,
+        loss.data_ptr(), gradient.data_ptr(), native.threads(),
+    )  # fmt: skip
+    return KnownGradient.apply((loss, gradient), proposed_weights)
 
 
 PROPOSAL_EXCESS.implementation(TRITON)(later("histograms.intervals_triton", "proposal_excess"))
 
 
 _excess = native.Function("proposal_excess", "ppqppqqfppi")
-
-
-class _Excess(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-        (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
-        loss, grad = weights.new_empty(rays), torch.empty_like(proposed_weights)
-        _excess(
-            native.pointer(edges, "edges", (rays, bins + 1)), native.pointer(weights, "weights", (rays, bins)), bins,
-            native.pointer(proposed, "proposed edges", (rays, proposed_bins + 1)),
-            native.pointer(proposed_weights, "proposed weights", (rays, proposed_bins)), proposed_bins, rays, EPS,
-            loss.data_ptr(), grad.data_ptr(), native.threads(),
-        )  # fmt: skip
-        ctx.save_for_backward(grad)
-        return loss
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor]:
-        (grad_weights,) = ctx.saved_tensors
-        return None, None, None, grad_weights * grad[:, None]

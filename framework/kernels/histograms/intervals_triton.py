@@ -17,6 +17,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.kernels.histograms.intervals import EPS
+from nerfloom.kernels.known_gradient import KnownGradient
 from nerfloom.kernels.triton_launch import depth_slope, launch, on_device, opacity_of, optical_depth
 
 BLOCK = 64
@@ -155,10 +156,7 @@ def _resample(edges, weights, shift, power, sums, out, bins, count, padding, ste
 def resample(
     edges: Tensor, weights: Tensor, shift: Tensor, count: int, power: float | Tensor, padding: float
 ) -> Tensor:
-    """Compute `nerfloom.kernels.histograms.intervals.resample`.
-
-    `edges`, `weights`, `shift`, `count`, `power` and `padding` are as there.
-    """
+    """Compute `intervals.resample` of `edges`, `weights`, `shift`, `count`, `power` and `padding`."""
     rays, bins = weights.shape
     out, sums = edges.new_empty(rays, count + 1), edges.new_empty(rays, bins, dtype=torch.float64)
     launch(
@@ -166,6 +164,17 @@ def resample(
         out, bins, count, float(padding), bins.bit_length(), BLOCK=BLOCK, num_warps=1,
     )  # fmt: skip
     return out
+
+
+@triton.jit
+def _touched(sums, edges, count, intervals, i, here, steps):
+    """Return the weight of the bins that each interval touches, from the sums of the weights of `count` bins."""
+    start = tl.load(intervals + i, mask=here, other=0.0)
+    end = tl.load(intervals + i + 1, mask=here, other=0.0)
+    left = _preceding(edges + 1, start, count, steps, False)
+    right = tl.maximum(_preceding(edges, end, count, steps, True), left)
+    weight = tl.load(sums + right - 1, mask=right > 0, other=0.0)
+    return weight - tl.load(sums + left - 1, mask=left > 0, other=0.0)
 
 
 @triton.jit
@@ -186,14 +195,8 @@ def _excess(
     for first in range(0, bins, BLOCK):
         i = first + tl.arange(0, BLOCK)
         here = i < bins
-        start = tl.load(edges + i, mask=here, other=0.0)
-        end = tl.load(edges + i + 1, mask=here, other=0.0)
-        left = _preceding(proposed + 1, start, proposed_bins, steps, False)
-        right = tl.maximum(_preceding(proposed, end, proposed_bins, steps, True), left)
-        bound = tl.load(sums + right - 1, mask=right > 0, other=0.0)
-        bound -= tl.load(sums + left - 1, mask=left > 0, other=0.0)
         weight = tl.load(weights + i, mask=here, other=0.0).to(tl.float64)
-        excess = weight - bound
+        excess = weight - _touched(sums, proposed, proposed_bins, edges, i, here, steps)
         excess = tl.where(here & (excess > 0), excess, 0.0)
         scaled = excess / (weight + eps)
         spread += tl.sum(excess * scaled, 0)
@@ -204,41 +207,20 @@ def _excess(
     for first in range(0, proposed_bins, BLOCK):
         j = first + tl.arange(0, BLOCK)
         here = j < proposed_bins
-        start = tl.load(proposed + j, mask=here, other=0.0)
-        end = tl.load(proposed + j + 1, mask=here, other=0.0)
-        left = _preceding(edges + 1, start, bins, steps, False)
-        right = tl.maximum(_preceding(edges, end, bins, steps, True), left)
-        change = tl.load(scaled_sums + right - 1, mask=right > 0, other=0.0)
-        change -= tl.load(scaled_sums + left - 1, mask=left > 0, other=0.0)
+        change = _touched(scaled_sums, edges, bins, proposed, j, here, steps)
         tl.store(of_weights + j, (-2 * change).to(tl.float32), mask=here)
 
 
-class _Excess(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, eps: float
-    ) -> Tensor:
-        (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
-        loss, of_weights = weights.new_empty(rays), torch.empty_like(proposed_weights)
-        sums, scaled = (weights.new_empty(rays, size, dtype=torch.float64) for size in (proposed_bins, bins))
-        steps = max(bins, proposed_bins).bit_length()
-        launch(
-            _excess, (rays,), edges, weights, proposed, proposed_weights, sums, scaled, loss, of_weights, bins,
-            proposed_bins, steps, eps, BLOCK=BLOCK, num_warps=1,
-        )  # fmt: skip
-        ctx.save_for_backward(of_weights)
-        return loss
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor, None]:
-        (of_weights,) = ctx.saved_tensors
-        return None, None, None, of_weights * grad[:, None], None
-
-
 def proposal_excess(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor) -> Tensor:
-    """Compute `nerfloom.kernels.histograms.intervals.proposal_excess`, with the gradient of the proposed weights.
-
-    `edges`, `weights`, `proposed` and `proposed_weights` are as there.
-    """
-    return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)), EPS)
+    """Compute `intervals.proposal_excess` of `edges`, `weights`, `proposed` and `proposed_weights`, with a gradient."""
+    inputs = (tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights))
+    edges, weights, proposed, proposed_weights = inputs
+    (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
+    loss, of_weights = weights.new_empty(rays), torch.empty_like(proposed_weights)
+    sums, scaled = (weights.new_empty(rays, size, dtype=torch.float64) for size in (proposed_bins, bins))
+    steps = max(bins, proposed_bins).bit_length()
+    launch(
+        _excess, (rays,), edges, weights, proposed, proposed_weights, sums, scaled, loss, of_weights, bins,
+        proposed_bins, steps, EPS, BLOCK=BLOCK, num_warps=1,
+    )  # fmt: skip
+    return KnownGradient.apply((loss, of_weights), proposed_weights)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels import native, result_cache
+from nerfloom.kernels.argument_checks import is_followed
 from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.grids.hash_grid import hash_grid
 from nerfloom.kernels.histograms.intervals import interval_weights
@@ -49,8 +50,7 @@ def _fits(rays: Rays, t: Tensor, density: GridDensity) -> bool:
 
 @PROPOSAL_WEIGHTS.implementation(CPP, fits=_fits)
 def _compiled(rays: Rays, t: Tensor, density: GridDensity) -> Tensor:
-    count, bins, learnt = len(rays), t.shape[1] - 1, (density.table, *density.weights)
-    follows = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in learnt)
+    count, bins, follows = len(rays), t.shape[1] - 1, is_followed(density.table, *density.weights)
     origins, directions, t = rays.origins.contiguous(), rays.directions.contiguous(), t.contiguous()
     weights = None if follows else torch.empty(count, bins)
     sizes = [(3,), (density.weights[0].shape[1],), (density.weights[-1].shape[0],), ()] if follows else []

@@ -85,10 +85,7 @@ def inverse_power_ladder(y: Tensor, power: float) -> Tensor:
 
 
 def spaced_reference(edges: Tensor, nears: Tensor, fars: Tensor, scale: float | None) -> Tensor:
-    """Compute distances (R, B) without a ladder in PyTorch, on any device and for any float type.
-
-    `edges`, `nears`, `fars` and `scale` are as in `spacing`.
-    """
+    """Compute `spacing` of `edges` (R, B) between `nears` and `fars`, with a `scale` and no ladder, in PyTorch."""
     if scale is None:
         return torch.lerp(nears[:, None], fars[:, None], edges)
     near, far = (to_disparity(t / scale)[:, None] for t in (nears, fars))

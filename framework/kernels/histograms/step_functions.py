@@ -14,14 +14,13 @@ Letters: R rays, B bins of a histogram, which has B + 1 sorted edges on every ra
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from nerfloom.base.device import to_float64
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, Operation
+from nerfloom.kernels.known_gradient import KnownGradient
 
 EPS = 1e-5
 """Added to proposed weights in a denominator. The paper's code has 1.2e-7 and clips gradients, which we do not. A bin
@@ -58,10 +57,7 @@ def blurred_weights(edges: Tensor, weights: Tensor, proposed: Tensor, radius: fl
 def blurred_excess_reference(
     edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float
 ) -> Tensor:
-    """Compute `blurred_excess` in PyTorch, on any device.
-
-    `edges`, `weights`, `proposed`, `proposed_weights` and `radius` are as in `blurred_excess`.
-    """
+    """Compute `blurred_excess` of `edges`, `weights`, `proposed`, `proposed_weights` and `radius` in PyTorch."""
     target = blurred_weights(edges, weights, proposed, radius).to(proposed_weights)
     excess = (target - proposed_weights).clamp(min=0)
     return (excess.square() / (proposed_weights + EPS)).sum(-1)
@@ -95,30 +91,17 @@ BLURRED_EXCESS = Operation("blurred_excess", blurred_excess_reference)
 
 @BLURRED_EXCESS.implementation(CPP)
 def _compiled(edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float) -> Tensor:
-    return _Excess.apply(*(tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights)), radius)
+    inputs = (tensor.contiguous() for tensor in (edges, weights, proposed, proposed_weights))
+    edges, weights, proposed, proposed_weights = inputs
+    (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
+    loss, gradient = weights.new_empty(rays), torch.empty_like(proposed_weights)
+    _excess(
+        native.pointer(edges, "edges", (rays, bins + 1)), native.pointer(weights, "weights", (rays, bins)), bins,
+        native.pointer(proposed, "proposed edges", (rays, proposed_bins + 1)),
+        native.pointer(proposed_weights, "proposed weights", (rays, proposed_bins)), proposed_bins, rays, radius,
+        EPS, loss.data_ptr(), gradient.data_ptr(), native.threads(),
+    )  # fmt: skip
+    return KnownGradient.apply((loss, gradient), proposed_weights)
 
 
 _excess = native.Function("blurred_excess", "ppqppqqdfppi")
-
-
-class _Excess(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, edges: Tensor, weights: Tensor, proposed: Tensor, proposed_weights: Tensor, radius: float
-    ) -> Tensor:
-        (rays, bins), proposed_bins = weights.shape, proposed_weights.shape[1]
-        loss, grad = weights.new_empty(rays), torch.empty_like(proposed_weights)
-        _excess(
-            native.pointer(edges, "edges", (rays, bins + 1)), native.pointer(weights, "weights", (rays, bins)), bins,
-            native.pointer(proposed, "proposed edges", (rays, proposed_bins + 1)),
-            native.pointer(proposed_weights, "proposed weights", (rays, proposed_bins)), proposed_bins, rays, radius,
-            EPS, loss.data_ptr(), grad.data_ptr(), native.threads(),
-        )  # fmt: skip
-        ctx.save_for_backward(grad)
-        return loss
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, None, Tensor, None]:
-        (grad_weights,) = ctx.saved_tensors
-        return None, None, None, grad_weights * grad[:, None], None

@@ -129,10 +129,7 @@ def _may_hold(photograph: Photograph, centers: Tensor, radius: float, every: boo
 
 
 def hold_balls_reference(photograph: Photograph, centers: Tensor, radius: float, held: Tensor, every: bool) -> None:
-    """Compute `hold_balls` in PyTorch, on any device.
-
-    `photograph`, `centers`, `radius`, `held` and `every` are as in `hold_balls`.
-    """
+    """Compute `hold_balls` of `photograph`, `centers`, `radius`, `held` and `every` in PyTorch, on any device."""
     rest = (held if every else ~held).nonzero().squeeze(-1)
     held[rest] = _may_hold(photograph, centers[rest], radius, every)
 

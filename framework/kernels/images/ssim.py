@@ -25,13 +25,13 @@ rows are in the processor's cache, and the backward pass only multiplies it.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from nerfloom.kernels import native
 from nerfloom.kernels.dispatch import CPP, TRITON, Operation
+from nerfloom.kernels.known_gradient import KnownGradient
 from nerfloom.kernels.triton_backend import later
 
 WINDOW = 11
@@ -93,7 +93,7 @@ def _check(image: Tensor, target: Tensor) -> None:
         raise ValueError(f"SSIM needs two images (H, W, C), not {tuple(image.shape)} and {tuple(target.shape)}")
 
 
-def _check_window(image: Tensor, counted: Tensor | None = None) -> None:
+def _check_window(image: Tensor, counted: Tensor | None) -> None:
     height, width = image.shape[:2]
     if min(height, width) < WINDOW:
         raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, not {width}x{height}")
@@ -131,10 +131,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights:
 
 
 def photometric_reference(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
-    """Compute `photometric_loss` in torch, with derivatives of any order by both images.
-
-    `image`, `target`, `ssim_weight` and `weights` are as there.
-    """
+    """Compute `photometric_loss` of `image`, `target`, `ssim_weight` and `weights` in torch, with all derivatives."""
     by_means, by_variances = _similarities(image, target)
     dissimilar = 1 - by_means * by_variances
     if weights is not None:
@@ -152,11 +149,6 @@ def weighted_error(image: Tensor, target: Tensor, weights: Tensor | None) -> Ten
     """
     errors = (image - target).abs()
     return errors.mean() if weights is None else (errors * weights[..., None]).mean()
-
-
-def ssim_reference(image: Tensor, target: Tensor) -> Tensor:
-    """Compute `ssim` of all windows of `image` and `target` in torch, with derivatives of any order by both."""
-    return similarity_reference(image, target, None, True)
 
 
 def structure(image: Tensor, target: Tensor, counted: Tensor | None = None) -> Tensor:
@@ -211,40 +203,21 @@ SIMILARITY = Operation("similarity", similarity_reference)
 _photometric = native.Function("photometric", "ppqqqffpppi", "d")
 
 
-class _Photometric(torch.autograd.Function):
-    """The compiled sweep over an image; it computes the value and the derivative."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None, learned: bool
-    ) -> Tensor:
-        derivative = torch.empty_like(image) if learned else None
-        least = None if weights is None else least_in_windows(weights)
-        value = _photometric(
-            native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
-            *image.shape, ssim_weight, C1,
-            None if weights is None else native.pointer(weights, "the weights", image.shape[:2]),
-            None if least is None else native.pointer(least, "the windows' weights", least.shape),
-            None if derivative is None else derivative.data_ptr(), native.threads(),
-        )  # fmt: skip
-        if derivative is not None:
-            ctx.save_for_backward(derivative)
-        return image.new_tensor(value)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
-        (derivative,) = ctx.saved_tensors
-        # A term of a loss has a gradient of 1, so the usual step needs no pass over the image.
-        return derivative if float(grad) == 1 else derivative * grad, None, None, None, None
-
-
 @PHOTOMETRIC.implementation(CPP, differentiable=1)
 def _compiled(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
-    learned = image.requires_grad and torch.is_grad_enabled()
+    image, target = image.contiguous(), target.contiguous()
     weights = None if weights is None else weights.contiguous()
-    out: Tensor = _Photometric.apply(image.contiguous(), target.contiguous(), ssim_weight, weights, learned)
-    return out
+    derivative = torch.empty_like(image) if image.requires_grad and torch.is_grad_enabled() else None
+    least = None if weights is None else least_in_windows(weights)
+    value = _photometric(
+        native.pointer(image, "the image", image.shape), native.pointer(target, "the target", image.shape),
+        *image.shape, ssim_weight, C1,
+        None if weights is None else native.pointer(weights, "the weights", image.shape[:2]),
+        None if least is None else native.pointer(least, "the windows' weights", least.shape),
+        None if derivative is None else derivative.data_ptr(), native.threads(),
+    )  # fmt: skip
+    found = image.new_tensor(value)
+    return found if derivative is None else KnownGradient.apply((found, derivative), image)
 
 
 @SIMILARITY.implementation(CPP, order=0)

@@ -10,7 +10,6 @@ blurs three maps in the same way. An element of a map is a value of the image, w
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import torch
 import triton
@@ -18,7 +17,8 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.kernels.images.ssim import C1, C2, SIGMA, WINDOW, least_in_windows, weighted_error
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.known_gradient import KnownGradient
+from nerfloom.kernels.triton_launch import blocks, launch, own_rows
 
 BLOCK = 256
 """Elements per program."""
@@ -35,8 +35,7 @@ def _line(device: torch.device) -> Tensor:
 @triton.jit
 def _rows(image, target, line, maps, count, row, shorter, channels, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
     """Blur u, v, u^2 and v^2 along rows of `row` values, which leaves `shorter` values of each."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = own_rows(count, BLOCK)
     at = i // shorter * row + i % shorter
     mean_u = tl.zeros([BLOCK], tl.float32)
     mean_v, square_u, square_v = mean_u, mean_u, mean_u
@@ -61,8 +60,7 @@ def _windows(
 ):  # fmt: skip
     """Blur maps of `size` elements along columns; sum 1 - S, and write the three derivatives of S if requested. Both
     are multiplied by the weights of windows, if there are any."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = own_rows(count, BLOCK)
     mean_u = tl.zeros([BLOCK], tl.float32)
     mean_v, square_u, square_v = mean_u, mean_u, mean_u
     for k in range(WINDOW):
@@ -94,8 +92,7 @@ def _windows(
 @triton.jit
 def _columns_back(slopes, line, maps, size, count, row, windows, WINDOW: tl.constexpr, BLOCK: tl.constexpr):
     """Sum three maps of `size` elements, in `windows` rows, over the windows that cover each row of the image."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = own_rows(count, BLOCK)
     y = i // row
     one = tl.zeros([BLOCK], tl.float32)
     two, three = one, one
@@ -117,8 +114,7 @@ def _rows_back(
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sum the maps over the windows that cover each value of the image, and write the derivative."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = own_rows(count, BLOCK)
     y, x = i // row, i % row
     one = tl.zeros([BLOCK], tl.float32)
     two, three = one, one
@@ -134,45 +130,33 @@ def _rows_back(
     tl.store(derivative + i, scale * (one + 2 * (a + b - 1) * two + 2 * (a - b) * three), mask=here)
 
 
-class _SSIM(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, weights: Tensor | None, learned: bool) -> Tensor:
-        height, width, channels = image.shape
-        line, constants = _line(image.device), {"WINDOW": WINDOW, "BLOCK": BLOCK}
-        row, shorter, windows = width * channels, (width - WINDOW + 1) * channels, height - WINDOW + 1
-        size, count = height * shorter, windows * shorter
-        maps, sums = image.new_empty(4, size), image.new_empty(blocks(count, BLOCK))
-        slopes = image.new_empty(3, count) if learned else None
-        launch(_rows, (blocks(size, BLOCK),), image, target, line, maps, size, row, shorter, channels, **constants)
-        least = None if weights is None else least_in_windows(weights).contiguous()
-        launch(
-            _windows, (blocks(count, BLOCK),), maps, line, least, sums, slopes, size, count, shorter, channels, C1, C2,
-            **constants,
-        )  # fmt: skip
-        if slopes is not None:
-            derivative = torch.empty_like(image)
-            launch(
-                _columns_back, (blocks(size, BLOCK),), slopes, line, maps, count, size, shorter, windows, **constants
-            )
-            launch(
-                _rows_back, (blocks(image.numel(), BLOCK),), maps, line, image, target, derivative, size,
-                image.numel(), row, shorter, channels, 1 / count, **constants,
-            )  # fmt: skip
-            ctx.save_for_backward(derivative)
-        return (1 - sums.double().sum() / count).to(image.dtype)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        (derivative,) = ctx.saved_tensors
-        return derivative * grad, None, None, None
+def _ssim(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+    """Return the mean SSIM of contiguous images, and its derivative by the first if that is followed."""
+    height, width, channels = image.shape
+    line, constants = _line(image.device), {"WINDOW": WINDOW, "BLOCK": BLOCK}
+    row, shorter, windows = width * channels, (width - WINDOW + 1) * channels, height - WINDOW + 1
+    size, count = height * shorter, windows * shorter
+    maps, sums = image.new_empty(4, size), image.new_empty(blocks(count, BLOCK))
+    slopes = image.new_empty(3, count) if image.requires_grad and torch.is_grad_enabled() else None
+    launch(_rows, (blocks(size, BLOCK),), image, target, line, maps, size, row, shorter, channels, **constants)
+    least = None if weights is None else least_in_windows(weights).contiguous()
+    launch(
+        _windows, (blocks(count, BLOCK),), maps, line, least, sums, slopes, size, count, shorter, channels, C1, C2,
+        **constants,
+    )  # fmt: skip
+    value = (1 - sums.double().sum() / count).to(image.dtype)
+    if slopes is None:
+        return value
+    derivative = torch.empty_like(image)
+    launch(_columns_back, (blocks(size, BLOCK),), slopes, line, maps, count, size, shorter, windows, **constants)
+    launch(
+        _rows_back, (blocks(image.numel(), BLOCK),), maps, line, image, target, derivative, size, image.numel(), row,
+        shorter, channels, 1 / count, **constants,
+    )  # fmt: skip
+    return KnownGradient.apply((value, derivative), image)
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float, weights: Tensor | None = None) -> Tensor:
-    """Compute `nerfloom.kernels.images.ssim.photometric_loss`, with the first derivative by the image.
-
-    `image`, `target`, `ssim_weight` and `weights` are as there.
-    """
-    learned = image.requires_grad and torch.is_grad_enabled()
-    similarity = _SSIM.apply(image.contiguous(), target.contiguous(), weights, learned)
+    """Compute `ssim.photometric_loss` of `image`, `target`, `ssim_weight` and `weights`, with its first derivative."""
+    similarity = _ssim(image.contiguous(), target.contiguous(), weights)
     return (1 - ssim_weight) * weighted_error(image, target, weights) + ssim_weight * (1 - similarity)

@@ -21,7 +21,7 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.compositing.density import bounded_sum, optical_depth
 from nerfloom.kernels.dispatch import TRITON, Operation
 from nerfloom.kernels.march.occupancy import Occupancy
-from nerfloom.kernels.march.waves import RUN, step_range
+from nerfloom.kernels.march.waves import RUN, _of_rays, step_range
 from nerfloom.kernels.triton_backend import later
 
 
@@ -139,10 +139,7 @@ def fill(
 def fill_reference(
     rays: Rays, occupancy: Occupancy, step: float, num_steps: int, shift: Tensor | None, capacities: tuple[int, int]
 ) -> Filled:
-    """Compute `fill` in PyTorch, on any device.
-
-    `rays`, `occupancy`, `step`, `num_steps`, `shift` and `capacities` are as in `fill`.
-    """
+    """Compute `fill` of `rays`, `occupancy`, `step`, `num_steps`, `shift` and `capacities` in PyTorch."""
     count, device, (runs_capacity, capacity) = len(rays), rays.origins.device, capacities
     enter, leave, first, steps = step_range(rays, occupancy, step, 0.0, shift)
     slices = occupancy.slices_of(rays.times)
@@ -178,10 +175,6 @@ def _places(mask: Tensor, capacity: int) -> Tensor:
     ranks = torch.where(mask, mask.cumsum(0) - 1, capacity).clamp(max=capacity)  # the others go past the end
     places = ranks.new_zeros(capacity + 1).scatter_(0, ranks, torch.arange(len(mask), device=mask.device))
     return places[:capacity]
-
-
-def _of_rays(values: Tensor | None, owners: Tensor) -> Tensor | None:
-    return None if values is None else values.index_select(0, owners)
 
 
 @torch.no_grad()

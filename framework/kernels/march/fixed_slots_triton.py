@@ -18,7 +18,7 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.march.fixed_slots import Filled, Placed, most_steps, share_out
 from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.kernels.march.waves_triton import SAMPLES, TritonMarch
-from nerfloom.kernels.triton_launch import blocks, launch, optical_depth
+from nerfloom.kernels.triton_launch import blocks, launch, optical_depth, own_rows
 
 
 def fill(
@@ -40,8 +40,7 @@ def fill(
 
 @triton.jit(do_not_specialize=["rays"])
 def _reach(sigma, starts, ends, offsets, counts, reached, budget, rays, BLOCK: tl.constexpr):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < rays
+    r, here = own_rows(rays, BLOCK)
     first, count = tl.load(offsets + r, mask=here, other=0), tl.load(counts + r, mask=here, other=0)
     depth, found = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.int64)
     going = (count > 0) & (depth < budget)

@@ -33,13 +33,8 @@ def sort_by_ray_reference(owners: Tensor, reached: Tensor, num_rays: int) -> tup
     check_indices(owners, num_rays, "rays")
     chosen = reached.nonzero().squeeze(-1)
     owners = owners.index_select(0, chosen)
-    return chosen.index_select(0, owners.argsort(stable=True)), _offsets(owners, num_rays)
-
-
-def _offsets(owners: Tensor, num_rays: int) -> Tensor:
-    """Return the offsets (R + 1,) of rays from the owners (N,) of samples."""
     counts = owners.new_zeros(num_rays).index_add_(0, owners, torch.ones_like(owners))
-    return functional.pad(counts.cumsum(0), (1, 0))
+    return chosen.index_select(0, owners.argsort(stable=True)), functional.pad(counts.cumsum(0), (1, 0))
 
 
 SORT_BY_RAY = Operation("sort_by_ray", sort_by_ray_reference)

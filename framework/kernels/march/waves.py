@@ -251,13 +251,12 @@ class ReferenceMarch(March):
         wave = self.waves[-1]
         tau = optical_depth(sigma.detach().to(self.spent.dtype), wave.t_ends - wave.t_starts)
         before = bounded_sum(tau, wave.owners, self.ranks, len(self.rays), self._in_wave)
-        if self.alive is None:
-            self.reached.append((~(before >= self.budget)).to(torch.uint8))
-            self.spent.index_add_(0, wave.owners, tau)
-            return
-        before = self.spent.index_select(0, wave.owners) + before
+        if self.alive is not None:
+            before = self.spent.index_select(0, wave.owners) + before
         self.reached.append((~(before >= self.budget)).to(torch.uint8))
         self.spent.index_add_(0, wave.owners, tau)
+        if self.alive is None:
+            return
         remaining = self.offsets.diff().index_select(0, self.alive) > self.num_returned
         going_on = remaining & ~(self.spent.index_select(0, self.alive) >= self.budget)
         self.alive = self.alive.index_select(0, going_on.nonzero().squeeze(-1))

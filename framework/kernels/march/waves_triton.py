@@ -22,7 +22,7 @@ from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.march.occupancy import BLOCK as CELLS
 from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.kernels.march.waves import March, Wave
-from nerfloom.kernels.triton_launch import blocks, launch, optical_depth
+from nerfloom.kernels.triton_launch import blocks, launch, optical_depth, own_rows
 
 RAYS, SAMPLES = 32, 256
 """Rays, and samples, per program."""
@@ -70,8 +70,7 @@ def _slab(origins, directions, box, r, here, axis: tl.constexpr, enter, leave):
 def _begin(
     origins, directions, nears, fars, shift, box, step, enters, leaves, firsts, alive, rays, BLOCK: tl.constexpr
 ):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < rays
+    r, here = own_rows(rays, BLOCK)
     enter, leave = tl.load(nears + r, mask=here, other=0.0), tl.load(fars + r, mask=here, other=0.0)
     enter = tl.where(enter < 0, 0.0, enter)
     enter, leave = _slab(origins, directions, box, r, here, 0, enter, leave)
@@ -129,8 +128,7 @@ def _wave(
     origins, directions, box, enters, leaves, firsts, slices, alive, nexts, occupied, distances, counts, places, limits,
     starts, ends, rays, limit, resolution, levels, step, growth, turn, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < rays
+    r, here = own_rows(rays, BLOCK)
     enter, leave = tl.load(enters + r, mask=here, other=0.0), tl.load(leaves + r, mask=here, other=0.0)
     first = tl.load(firsts + r, mask=here, other=0.0)
     # Where steps begin to grow: at `turn`, or at the ray's start.
@@ -194,8 +192,7 @@ def _pack(
     origins, directions, padded_starts, padded_ends, counts, offsets, starts, ends, owners, positions, slots, limit,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < slots
+    i, here = own_rows(slots, BLOCK)
     r, s = i // limit, i % limit
     here = here & (s < tl.load(counts + r, mask=here, other=0))
     n = tl.load(offsets + r, mask=here, other=0) + s
@@ -211,8 +208,7 @@ def _pack(
 
 @triton.jit(do_not_specialize=["rays"])
 def _advance(sigma, starts, ends, offsets, counts, spent, alive, reached, budget, rays, limit, BLOCK: tl.constexpr):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < rays
+    r, here = own_rows(rays, BLOCK)
     first, count = tl.load(offsets + r, mask=here, other=0), tl.load(counts + r, mask=here, other=0)
     depth = tl.load(spent + r, mask=here, other=0.0)
     for s in range(limit):

@@ -89,13 +89,9 @@ def chunks_of(owners: Tensor, count: int) -> Chunks:
 
 
 def grouped_mlp_reference(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], activation: Activation = "none",
     deferred: RowGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Compute `grouped_mlp` in PyTorch, on any device and for any float type, with derivatives of any order.
 
     `inputs`, `owners`, `table`, `widths`, `activation` and `deferred` are as in `grouped_mlp`; `deferred` is not used.
@@ -116,11 +112,7 @@ def grouped_mlp_reference(
 
 
 def grouped_density_mlp_reference(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    deferred: RowGradient | None = None,
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], deferred: RowGradient | None = None
 ) -> tuple[Tensor, Tensor]:
     """Compute `grouped_density_mlp` in PyTorch, on any device and for any float type.
 
@@ -131,13 +123,9 @@ def grouped_density_mlp_reference(
 
 
 def grouped_mlp(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], activation: Activation = "none",
     deferred: RowGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Return the outputs of rows of many fully connected networks, with ReLU between their layers.
 
     Row n is the output of network `owners[n]`, as `mlp` computes it with the weights and biases of this network alone.
@@ -163,28 +151,13 @@ def grouped_mlp(
 
 
 def grouped_density_mlp(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    deferred: RowGradient | None = None,
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], deferred: RowGradient | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return the density (N,) and features (N, D_out) of networks with the log-density as first output.
 
     It equals `nerfloom.kernels.math.split_density` of `grouped_mlp`, except that the first feature is the number of the
     row's network, without a gradient, so that other networks of the same cells can follow. Numbers below 2^24 are
-    exact.
-
-    Args:
-        inputs: parts (N, D_i) of the input, as in `grouped_mlp`.
-        owners: (N,) int64 network of each row.
-        table: (C, P) parameters of C networks, as in `layers_of`.
-        widths: number of features of the input, of each hidden layer, and of the output.
-        deferred: collects the gradient of the table, on compiled kernels; None to return it.
-
-    Raises:
-        ValueError: if the widths do not fit the inputs or the table.
-        IndexError: if a row's network does not exist.
+    exact. `inputs`, `owners`, `table`, `widths`, `deferred` and errors are as in `grouped_mlp`.
     """
     _check_shapes(inputs, owners, table, widths)
     return GROUPED_DENSITY_NETWORK((*inputs, table), inputs, owners, table, widths, deferred)
@@ -338,24 +311,16 @@ def _is_small(inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: S
 
 @GROUPED_NETWORK.implementation(CPP, fits=_is_small)
 def _compiled(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], activation: Activation = "none",
     deferred: RowGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     out: Tensor = _apply(_Plan(tuple(widths), activation, False), inputs, owners, table, deferred)
     return out
 
 
 @GROUPED_DENSITY_NETWORK.implementation(CPP, fits=_is_small)
 def _compiled_density(
-    inputs: Sequence[Tensor],
-    owners: Tensor,
-    table: Tensor,
-    widths: Sequence[int],
-    deferred: RowGradient | None = None,
+    inputs: Sequence[Tensor], owners: Tensor, table: Tensor, widths: Sequence[int], deferred: RowGradient | None = None
 ) -> tuple[Tensor, Tensor]:
     density, features = _apply(_Plan(tuple(widths), "none", True), inputs, owners, table, deferred)
     return density, features

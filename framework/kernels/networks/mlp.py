@@ -31,15 +31,10 @@ MAX_LAYERS = 8
 
 
 def mlp_reference(
-    inputs: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
-) -> Tensor:
-    """Compute `mlp` in PyTorch, on any device and for any float type, with derivatives of any order.
-
-    `inputs`, `weights`, `activation` and `biases` are as in `mlp`.
-    """
+) -> Tensor:  # fmt: skip
+    """Compute `mlp` of `inputs`, `weights`, `activation` and `biases` in PyTorch, with derivatives of any order."""
     x = torch.cat([part.to(weights[0].dtype) for part in inputs], dim=-1)
     for layer, weight in enumerate(weights):
         x = linear(torch.relu(x) if layer else x, weight, None if biases is None else biases[layer])
@@ -162,11 +157,9 @@ class _Call:
 
 
 def mlp(
-    inputs: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Return the output of a fully connected network with ReLU between its layers.
 
     The compiled form has first derivatives only. Under autocast it multiplies in bfloat16 and sums in float32 if the
@@ -198,22 +191,15 @@ def _check_widths(inputs: Sequence[Tensor], weights: Sequence[Tensor]) -> None:
 NETWORK = Operation("mlp", mlp_reference)
 
 
-def _is_small(
-    inputs: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    activation: Activation = "none",
-    biases: Sequence[Tensor] | None = None,
-) -> bool:
+def _is_small(inputs: Sequence[Tensor], weights: Sequence[Tensor], *rest: Any, **named: Any) -> bool:
     return len(weights) <= MAX_LAYERS and all(max(weight.shape) <= MAX_WIDTH for weight in weights)
 
 
 @NETWORK.implementation(CPP, fits=_is_small)
 def _compiled(
-    inputs: Sequence[Tensor],
-    weights: Sequence[Tensor],
-    activation: Activation = "none",
+    inputs: Sequence[Tensor], weights: Sequence[Tensor], activation: Activation = "none",
     biases: Sequence[Tensor] | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     return _apply(_Plan(len(inputs), len(weights), activation, multiplies_bf16()), inputs, weights, biases)
 
 
@@ -234,15 +220,7 @@ def density_mlp(
     """Return the density (N,) and the outputs (N, D_out) of a network with the log-density as first output.
 
     It equals `nerfloom.kernels.math.split_density` of `mlp`, without separate passes over the outputs and their
-    gradient.
-
-    Args:
-        inputs: parts (N, D_i) of the input, as in `mlp`.
-        weights: (D_out, D_in) weights of each layer.
-        biases: (D_out,) biases of each layer; None for no biases.
-
-    Raises:
-        ValueError: if the widths of inputs and layers do not fit.
+    gradient. `inputs`, `weights`, `biases` and errors are as in `mlp`.
     """
     _check_widths(inputs, weights)
     return DENSITY_NETWORK((*inputs, *weights, *(biases or ())), inputs, weights, biases)
@@ -251,13 +229,7 @@ def density_mlp(
 DENSITY_NETWORK: Operation[..., tuple[Tensor, Tensor]] = Operation("density_mlp", density_mlp_reference)
 
 
-def _is_small_density(
-    inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
-) -> bool:
-    return _is_small(inputs, weights)
-
-
-@DENSITY_NETWORK.implementation(CPP, fits=_is_small_density)
+@DENSITY_NETWORK.implementation(CPP, fits=_is_small)
 def _compiled_density(
     inputs: Sequence[Tensor], weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:

@@ -66,15 +66,9 @@ def raw_of(depths: Tensor) -> Tensor:
 
 
 def light_of(
-    layout: OctreeLayout,
-    depths: Tensor,
-    coefficients: Tensor,
-    rays: Rays,
-    background: Tensor,
-    stop: float,
-    peaks: Tensor | None = None,
-    smallest: Tensor | None = None,
-) -> OctreeLight:
+    layout: OctreeLayout, depths: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float,
+    peaks: Tensor | None = None, smallest: Tensor | None = None,
+) -> OctreeLight:  # fmt: skip
     """Compute the light of rays in PyTorch, with the walk of `walk.py` and autograd's gradient.
 
     Args:

@@ -78,10 +78,7 @@ def trace_packed(
 def trace_packed_reference(
     layout: OctreeLayout, leaves: PackedLeaves, rays: Rays, background: Tensor, stop: float = 0.0
 ) -> OctreeLight:
-    """Compute `trace_packed` in PyTorch, on any device and for any float type.
-
-    `layout`, `leaves`, `rays`, `background` and `stop` are as in `trace_packed`.
-    """
+    """Compute `trace_packed` of `layout`, `leaves`, `rays`, `background` and `stop` in PyTorch, for any float type."""
     kind = rays.origins.dtype
     level = layout.level_of(torch.arange(len(leaves.codes), device=leaves.codes.device))
     values = leaves.depths(level).to(kind), leaves.coefficients().to(kind)

@@ -31,15 +31,9 @@ _backward: Callable[..., int] = native.Function("octree_trace_backward", LAYOUT 
 
 
 def trace_octree(
-    layout: OctreeLayout,
-    raw: Tensor,
-    coefficients: Tensor,
-    rays: Rays,
-    background: Tensor,
-    stop: float = 0.0,
-    deferred: tuple[RowGradient, RowGradient] | None = None,
-    peaks: Tensor | None = None,
-) -> OctreeLight:
+    layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float = 0.0,
+    deferred: tuple[RowGradient, RowGradient] | None = None, peaks: Tensor | None = None,
+) -> OctreeLight:  # fmt: skip
     """Return the light of R rays through an octree, with a gradient of its leaves; the reference has all gradients.
 
     Args:

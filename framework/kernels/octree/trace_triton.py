@@ -26,7 +26,7 @@ from nerfloom.kernels.octree.light import OctreeLight, contiguous, outputs_of
 from nerfloom.kernels.octree.packed import PackedLeaves
 from nerfloom.kernels.octree.walk import smallest_cells
 from nerfloom.kernels.octree.walk_triton import FRAME, _advance, _begin, _change, _look, _outside, _place
-from nerfloom.kernels.triton_launch import blocks, launch, opacity_of
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, opacity_of, own_rows
 
 RAYS = 32
 """Rays per program."""
@@ -36,9 +36,7 @@ CODES = tl.constexpr(packed.CODES)
 @triton.jit
 def _basis(directions, r, here, BASIS: tl.constexpr, N: tl.constexpr, BLOCK: tl.constexpr):
     """Return the harmonics (BLOCK, N) of rays' directions, once for each channel."""
-    x = tl.load(directions + r * 3, mask=here, other=0.0)
-    y = tl.load(directions + r * 3 + 1, mask=here, other=0.0)
-    z = tl.load(directions + r * 3 + 2, mask=here, other=0.0)
+    x, y, z = load_three(directions + r * 3, here)
     k, out = tl.arange(0, N) % BASIS, tl.full([BLOCK, N], 0.28209479177387814, tl.float32)
     for number in tl.static_range(1, BASIS):
         out = tl.where((k == number)[None, :], harmonics(x, y, z, number)[:, None], out)
@@ -105,8 +103,8 @@ def _walk(
     levels, limit, rays, BASIS: tl.constexpr, N: tl.constexpr, LIMITED: tl.constexpr, MANY: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here, columns = r < rays, tl.arange(0, N)
+    r, here = own_rows(rays, BLOCK)
+    columns = tl.arange(0, N)
     if of_color is not None:  # the backward pass
         opaque, behind, mixed = _known(directions, color, opacity, of_color, of_opacity, r, here, BASIS, N, BLOCK)
     level, far, t = _begin(origins, directions, nears, fars, smallest, frames, numbers, r, here, levels, LIMITED, BLOCK)
@@ -230,10 +228,9 @@ def trace_octree(
     layout: OctreeLayout, raw: Tensor, coefficients: Tensor, rays: Rays, background: Tensor, stop: float = 0.0,
     deferred: tuple[RowGradient, RowGradient] | None = None, peaks: Tensor | None = None,
 ) -> OctreeLight:  # fmt: skip
-    """Compute `nerfloom.kernels.octree.trace.trace_octree`, with first derivatives of the leaves.
+    """Compute `trace.trace_octree` of `layout`, `raw`, `coefficients`, `rays`, `background`, `stop` and `peaks`.
 
-    Autograd accumulates the gradients: `deferred` is not used. `layout`, `raw`, `coefficients`, `rays`, `background`,
-    `stop` and `peaks` are as there.
+    Autograd accumulates the gradients of the leaves: `deferred` is not used.
     """
     inputs = raw.contiguous(), coefficients.contiguous()
     return OctreeLight(*_Trace.apply(*inputs, layout, contiguous(rays), background.contiguous(), stop, peaks))
@@ -242,10 +239,7 @@ def trace_octree(
 def trace_packed(
     layout: OctreeLayout, leaves: PackedLeaves, rays: Rays, background: Tensor, stop: float = 0.0
 ) -> OctreeLight:
-    """Compute `nerfloom.kernels.octree.packed.trace_packed`.
-
-    `layout`, `leaves`, `rays`, `background` and `stop` are as there.
-    """
+    """Compute `packed.trace_packed` of `layout`, `leaves`, `rays`, `background` and `stop`."""
     smallest, rays = smallest_cells(rays), contiguous(rays)
     out = outputs_of(rays)[0]
     _run(
@@ -256,10 +250,7 @@ def trace_packed(
 
 
 def raise_weights(layout: OctreeLayout, raw: Tensor, rays: Rays, weights: Tensor, stop: float = 0.0) -> Tensor:
-    """Compute `nerfloom.kernels.octree.weights.raise_weights`.
-
-    `layout`, `raw`, `rays`, `weights` and `stop` are as there.
-    """
+    """Compute `weights.raise_weights` of `layout`, `raw`, `rays`, `weights` and `stop`."""
     rays, opacity = contiguous(rays), torch.empty_like(rays.fars)
     out = None, opacity, None, None, None
     _run(layout, rays, stop, None, raw.contiguous(), None, None, (None, None), None, out, weights)

@@ -59,14 +59,9 @@ class Blended(NamedTuple):
 
 
 def blend(
-    records: Tensor,
-    lists: TileLists,
-    width: int,
-    height: int,
-    background: Tensor,
-    channels: int = 3,
+    records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int = 3,
     median: bool = False,
-) -> Blended:
+) -> Blended:  # fmt: skip
     """Blend the Gaussians on an image.
 
     Columns ABSOLUTE_X and ABSOLUTE_Y of the records' gradient hold sums of absolute gradients.
@@ -86,10 +81,7 @@ def blend(
 def blend_reference(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
-    """Compute `blend` in torch, tile by tile, on any device and in any float type.
-
-    `records`, `lists`, `width`, `height`, `background`, `channels` and `median` are as in `blend`.
-    """
+    """Compute `blend` of `records`, `lists`, `width`, `height`, `background`, `channels` and `median` tile by tile."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     behind = torch.cat([background.to(records), records.new_zeros(channels - 3)])
     tiles, left, middles = [], [], []

@@ -39,7 +39,7 @@ from nerfloom.kernels.splats.record_triton import (
     Y,
 )
 from nerfloom.kernels.splats.tiles import TileLists
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, own_rows, store_three
 
 BATCH = 8
 """Gaussians that are evaluated together."""
@@ -119,15 +119,14 @@ def _forward(
         n += BATCH
     tl.store(used + tile, tl.minimum(n, end) - tl.load(offsets + tile))
     image += pixel * CHANNELS
-    tl.store(image, red + through * tl.load(background), mask=on)
-    tl.store(image + 1, green + through * tl.load(background + 1), mask=on)
-    tl.store(image + 2, blue + through * tl.load(background + 2), mask=on)
+    red += through * tl.load(background)
+    green += through * tl.load(background + 1)
+    blue += through * tl.load(background + 2)
+    store_three(image, red, green, blue, on)
     if CHANNELS > 3:
         tl.store(image + 3, distance, mask=on)
     if CHANNELS > 4:
-        tl.store(image + 4, normal_x, mask=on)
-        tl.store(image + 5, normal_y, mask=on)
-        tl.store(image + 6, normal_z, mask=on)
+        store_three(image + 4, normal_x, normal_y, normal_z, on)
     tl.store(through_image + pixel, through, mask=on)
     if median_image is not None:
         tl.store(median_image + pixel, median, mask=on)
@@ -162,9 +161,7 @@ def _backward(
     through = tl.where(on, 1.0, 0.0)
     image += pixel * CHANNELS
     of_image += pixel * CHANNELS
-    red = tl.load(of_image, mask=on, other=0.0)
-    green = tl.load(of_image + 1, mask=on, other=0.0)
-    blue = tl.load(of_image + 2, mask=on, other=0.0)
+    red, green, blue = load_three(of_image, on)
     # The light from behind a Gaussian is the whole image minus the Gaussian and everything in front of it.
     behind = red * tl.load(image, mask=on, other=0.0) + green * tl.load(image + 1, mask=on, other=0.0)
     behind += blue * tl.load(image + 2, mask=on, other=0.0)
@@ -206,8 +203,7 @@ def _sum(total, k: tl.constexpr):
 @triton.jit(do_not_specialize=["count"])
 def _gather(records, firsts, parts, out, count, BLOCK: tl.constexpr):
     """Add up the sums of each Gaussian's entries, in the order of the tiles, and write the gradient of its record."""
-    g = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = g < count
+    g, here = own_rows(count, BLOCK)
     k = tl.arange(0, RECORD)
     begin = tl.load(firsts + g, mask=here, other=0)
     entries = tl.load(firsts + g + 1, mask=here, other=0) - begin
@@ -274,8 +270,8 @@ class _Blend(torch.autograd.Function):
 def blend(
     records: Tensor, lists: TileLists, width: int, height: int, background: Tensor, channels: int, median: bool
 ) -> Blended:
-    """Compute `nerfloom.kernels.splats.blend.blend`, with first derivatives of images of 3 or 4 channels.
+    """Compute `blend.blend` of `records`, `lists`, `width`, `height`, `background`, `channels` and `median`.
 
-    `records`, `lists`, `width`, `height`, `background`, `channels` and `median` are as there.
+    Images of 3 or 4 channels have first derivatives.
     """
     return Blended(*_Blend.apply(records.contiguous(), lists, width, height, background.contiguous(), channels, median))

@@ -39,15 +39,10 @@ def pack_gaussians(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     dtype: torch.dtype = torch.float32,
 ) -> PackedGaussians:  # fmt: skip
-    """Pack N Gaussians in their order; neighbours in it should be neighbours in space.
+    """Pack N Gaussians, at least one, in their order; neighbours in it should be neighbours in space.
 
     Args:
-        means: (N, 3) centres, scene coordinates; N is at least 1. All parameters are finite.
-        log_scales: (N, 3) logarithms of the standard deviations along the axes, of scene units.
-        rotations: (N, 4) quaternions w, x, y, z of any length but 0.
-        logits: (N,) opacities before the sigmoid.
-        colors: (N, 3) coefficients of the harmonic of degree 0; 0 is grey.
-        harmonics: (N, 3, K) coefficients of the degrees from 1; K is 0, 3, 8 or 15.
+        means, log_scales, rotations, logits, colors, harmonics: as in `project_gaussians`, but all finite.
         dtype: type of the stored harmonics, float32 or bfloat16.
     """
     count = len(means)
@@ -88,23 +83,12 @@ def project_packed(packed: PackedGaussians, camera: SplatCamera, degree: int = 3
 
 
 def packed_sort_keys(packed: PackedGaussians, camera: SplatCamera) -> Tensor | None:
-    """Return the keys (B * PACK,) of `sort_keys` for packed Gaussians.
-
-    Args:
-        packed: B blocks of Gaussians.
-        camera: the camera.
-    """
+    """Return the keys (B * PACK,) of `sort_keys` of `packed` Gaussians for a `camera`."""
     return sort_keys(packed.values[:, : WIDTHS[0]].transpose(1, 2).reshape(-1, WIDTHS[0]), camera)
 
 
 def project_packed_reference(packed: PackedGaussians, camera: SplatCamera, basis: int) -> Tensor:
-    """Compute `project_packed` in torch.
-
-    Args:
-        packed: B blocks of Gaussians.
-        camera: the camera.
-        basis: number of harmonics that are used beyond the first: 0, 3, 8 or 15.
-    """
+    """Compute `project_packed` of `packed` and `camera` in torch; `basis` is as in `project_reference`."""
     rows = packed.values.transpose(1, 2).flatten(0, 1)
     means, log_scales, rotations, logits, colors = rows.split(WIDTHS, 1)
     harmonics = packed.harmonics.permute(0, 3, 1, 2).flatten(0, 1).to(rows)

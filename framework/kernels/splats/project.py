@@ -363,10 +363,8 @@ def _compiled(
     return records, dropped[0]
 
 
-def _is_pinhole(
-    means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
-    camera: SplatCamera, basis: int,
-) -> bool:  # fmt: skip
+def _is_pinhole(*given: Any) -> bool:
+    camera: SplatCamera = given[6]
     return camera.lens is None and not camera.unscented
 
 

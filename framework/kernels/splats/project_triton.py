@@ -25,8 +25,6 @@ from nerfloom.kernels.splats.record_triton import (
     DISTANCE,
     GREEN,
     NORMAL_X,
-    NORMAL_Y,
-    NORMAL_Z,
     OPACITY,
     REACH_X,
     REACH_Y,
@@ -50,11 +48,10 @@ from nerfloom.kernels.splats.shapes_triton import (
     quaternion,
     rotation_back,
     shape_back,
-    three,
     to_camera,
     towards,
 )
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, own_rows, store_three
 
 BLOCK = 128
 """Gaussians that are taken together."""
@@ -79,9 +76,7 @@ def _put_normal(record, here, r00, r01, r02, r10, r11, r12, r20, r21, r22, s0, s
     n1 = tl.where(third, r12, tl.where(second, r11, r10))
     n2 = tl.where(third, r22, tl.where(second, r21, r20))
     sign = tl.where(n0 * x + n1 * y + n2 * z > 0, -1.0, 1.0)
-    tl.store(record + NORMAL_X, sign * n0, mask=here)
-    tl.store(record + NORMAL_Y, sign * n1, mask=here)
-    tl.store(record + NORMAL_Z, sign * n2, mask=here)
+    store_three(record + NORMAL_X, sign * n0, sign * n1, sign * n2, here)
 
 
 @triton.jit
@@ -106,12 +101,11 @@ def _forward(
     means, log_scales, rotations, logits, colors, coefficients, pose, records, dropped, count, stride, fx, fy, cx, cy,
     width, height, near, blur, ANTIALIASED: tl.constexpr, BASIS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
-    x, y, z = three(means, n, here)
+    n, here = own_rows(count, BLOCK)
+    x, y, z = load_three(means + n * 3, here)
     p0, p1, p2 = to_camera(pose, x, y, z)
     w, i, j, k, norm, sound = quaternion(rotations, n, here)
-    l0, l1, l2 = three(log_scales, n, here)
+    l0, l1, l2 = load_three(log_scales + n * 3, here)
     s0, s1, s2 = tl.exp(l0), tl.exp(l1), tl.exp(l2)
     logit = tl.load(logits + n, mask=here, other=0.0)
     valid = here & sound & (p2 > near)
@@ -193,14 +187,13 @@ def _backward(
     of_logits, of_colors, of_coefficients, of_pose, count, stride, fx, fy, cx, cy, width, height, blur,
     ANTIALIASED: tl.constexpr, BASIS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     record, grad = records + n * RECORD, gradient + n * RECORD
     shown = here & (tl.load(record + CUT, mask=here, other=0.0) > 0)
-    x, y, z = three(means, n, shown)
+    x, y, z = load_three(means + n * 3, shown)
     p0, p1, p2 = to_camera(pose, x, y, z)
     w, i, j, k, norm, _ = quaternion(rotations, n, shown)
-    s0, s1, s2 = three(log_scales, n, shown)
+    s0, s1, s2 = load_three(log_scales + n * 3, shown)
     s0, s1, s2 = tl.exp(s0), tl.exp(s1), tl.exp(s2)
     over, at_x, at_y, bounded_x, bounded_y = plane(p0, p1, tl.where(shown, p2, 1.0), fx, fy, cx, cy, width, height)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = axes(w, i, j, k)
@@ -281,14 +274,10 @@ def project_gaussians(
     means: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, colors: Tensor, harmonics: Tensor,
     camera: SplatCamera, basis: int,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Compute `nerfloom.kernels.splats.project.project_gaussians` for a pinhole camera, with first derivatives.
+    """Compute `project.project_reference` for a pinhole camera, with first derivatives.
 
-    The number of Gaussians that are left out stays on the GPU.
-
-    Args:
-        means, log_scales, rotations, logits, colors, harmonics: parameters of the Gaussians.
-        camera: the camera.
-        basis: number of harmonics that are used beyond the first: 0, 3, 8 or 15.
+    `means`, `log_scales`, `rotations`, `logits`, `colors`, `harmonics`, `camera` and `basis` are as there. The number
+    of Gaussians that are left out stays on the GPU.
     """
     tensors = [t.contiguous() for t in (means, log_scales, rotations, logits, colors, harmonics, camera.pose)]
     dropped = torch.zeros((), dtype=torch.int64, device=means.device)

@@ -12,36 +12,18 @@ import triton
 import triton.language as tl
 
 from nerfloom.kernels.splats.record_triton import DISTANCE, OPACITY, U_X, U_Y, V_Y, X, Y
-
-
-@triton.jit
-def three(values, n, here):
-    """Return the columns of rows of three.
-
-    Its arguments are `values, n, here`.
-    """
-    row = values + n * 3
-    x, y = tl.load(row, mask=here, other=0.0), tl.load(row + 1, mask=here, other=0.0)
-    return x, y, tl.load(row + 2, mask=here, other=0.0)
+from nerfloom.kernels.triton_launch import store_three
 
 
 @triton.jit
 def put_three(values, n, here, shown, x, y, z):
-    """Write rows of three values, zeros for invisible Gaussians.
-
-    Its arguments are `values, n, here, shown, x, y, z`.
-    """
-    tl.store(values + n * 3, tl.where(shown, x, 0.0), mask=here)
-    tl.store(values + n * 3 + 1, tl.where(shown, y, 0.0), mask=here)
-    tl.store(values + n * 3 + 2, tl.where(shown, z, 0.0), mask=here)
+    """Write `x`, `y` and `z` to the rows `n` of `values` that are `here`, and zeros unless they are `shown`."""
+    store_three(values + n * 3, tl.where(shown, x, 0.0), tl.where(shown, y, 0.0), tl.where(shown, z, 0.0), here)
 
 
 @triton.jit
 def to_camera(pose, x, y, z):
-    """Return positions in the camera's frame.
-
-    Its arguments are `pose, x, y, z`.
-    """
+    """Return positions `x`, `y`, `z` in the frame of the camera of a `pose`."""
     p0 = tl.load(pose) * x + tl.load(pose + 1) * y + tl.load(pose + 2) * z + tl.load(pose + 3)
     p1 = tl.load(pose + 4) * x + tl.load(pose + 5) * y + tl.load(pose + 6) * z + tl.load(pose + 7)
     p2 = tl.load(pose + 8) * x + tl.load(pose + 9) * y + tl.load(pose + 10) * z + tl.load(pose + 11)
@@ -60,9 +42,9 @@ def _centre(pose):
 
 @triton.jit
 def quaternion(rotations, n, here):
-    """Return unit quaternions, their lengths, 1 where they are too short, and whether they are long enough.
+    """Return rows `n` of `rotations` that are `here`, as unit quaternions, their lengths, and whether these suffice.
 
-    Its arguments are `rotations, n, here`.
+    Where a length does not suffice, 1 is returned for it.
     """
     row = rotations + n * 4
     w, x = tl.load(row, mask=here, other=1.0), tl.load(row + 1, mask=here, other=0.0)
@@ -75,10 +57,7 @@ def quaternion(rotations, n, here):
 
 @triton.jit
 def axes(w, x, y, z):
-    """Return the rotation matrices of unit quaternions, row by row.
-
-    Its arguments are `w, x, y, z`.
-    """
+    """Return the rotation matrices of unit quaternions `w`, `x`, `y`, `z`, row by row."""
     r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     r10, r11, r12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     r20, r21, r22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
@@ -113,9 +92,9 @@ def column(pose, r0, r1, r2, s, over, bounded_x, bounded_y, fx, fy):
 
 @triton.jit
 def covariance(a0, a1, a2, b0, b1, b2, blur):
-    """Return the covariance a, b, c, its determinant, that without the blur, and the product of the rows of T.
+    """Return the covariance a, b, c, its determinant, that without the `blur`, and the product of the rows of T.
 
-    Its arguments are `a0, a1, a2, b0, b1, b2, blur`.
+    The rows are `a0, a1, a2` and `b0, b1, b2`.
     """
     c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
     first, second = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
@@ -126,10 +105,7 @@ def covariance(a0, a1, a2, b0, b1, b2, blur):
 
 @triton.jit
 def towards(x, y, z, pose):
-    """Return the unit vectors from the camera to positions, and the distances.
-
-    Its arguments are `x, y, z, pose`.
-    """
+    """Return the unit vectors from the camera of a `pose` to positions `x`, `y`, `z`, and the distances."""
     center_x, center_y, center_z = _centre(pose)
     x, y, z = x - center_x, y - center_y, z - center_z
     length = tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-20)

@@ -109,7 +109,7 @@ def _counts(values: Tensor, count: int) -> Tensor:
     return values.new_zeros(count).index_add_(0, values, torch.ones_like(values))
 
 
-TILES = Operation("tile_lists", tile_lists_reference)
+TILES: Operation[..., TileLists] = Operation("tile_lists", tile_lists_reference)
 
 
 @TILES.implementation(FEW_OPERATIONS, types=None)
@@ -158,14 +158,7 @@ _bound = native.Function("splat_bound", "pqiii", "q")
 _bin = native.Function("splat_bin", "pqpqiiqppppi", "q")
 
 
-def _for_all(
-    records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
-    keys: Tensor | None = None,
-) -> bool:  # fmt: skip
-    return capacity is None
-
-
-@TILES.implementation(CPP, fits=_for_all)
+@TILES.implementation(CPP, fits=lambda *given: given[4] is None)  # without a capacity
 def _compiled(
     records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,

@@ -19,7 +19,7 @@ from nerfloom.kernels.splats import tiles
 from nerfloom.kernels.splats.project import Record
 from nerfloom.kernels.splats.record_triton import CUT, REACH_X, REACH_Y, RECORD, U_X, U_Y, V_Y, X, Y
 from nerfloom.kernels.splats.tiles import TileLists
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, own_rows
 
 BLOCK = 32
 """Gaussians that are taken together, by one warp."""
@@ -64,8 +64,7 @@ def _touches(record, here, column, row):
 @triton.jit(do_not_specialize=["count"])
 def _list(records, distances, counts, firsts, keys, owners, count, columns, rows, BLOCK: tl.constexpr):
     """Count the tiles of each Gaussian, or, if there are `firsts`, write the keys and owners of the entries."""
-    g = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = g < count
+    g, here = own_rows(count, BLOCK)
     record = records + g * RECORD
     here = here & (tl.load(record + CUT, mask=here, other=0.0) > 0)
     if firsts is not None:
@@ -97,10 +96,9 @@ def tile_lists(
     records: Tensor, width: int, height: int, for_gradients: bool = True, capacity: int | None = None,
     keys: Tensor | None = None,
 ) -> TileLists:  # fmt: skip
-    """Compute `nerfloom.kernels.splats.tiles.tile_lists` of `records`, `width` and `height`; `for_gradients` or not.
+    """Compute `tiles.tile_lists` of `records`, `width`, `height`, `for_gradients`, `capacity` and `keys`.
 
-    A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone. The first Gaussians have the
-    `capacity`. They are sorted by `keys`, if there are some.
+    A Gaussian is listed in a tile only if its ellipse reaches it, not its box alone.
 
     Raises:
         ValueError: if there are 2^31 entries or more.

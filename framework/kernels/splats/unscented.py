@@ -51,13 +51,9 @@ TURN = 2 * math.pi
 
 
 def unscented(
-    at: Tensor,
-    axes: Tensor,
-    model: str,
-    lens: Distortion | None,
-    intrinsics: tuple[float, float, float, float],
+    at: Tensor, axes: Tensor, model: str, lens: Distortion | None, intrinsics: tuple[float, float, float, float],
     width: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Project K Gaussians by the unscented transform. Differentiable.
 
     Args:

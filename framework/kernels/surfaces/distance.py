@@ -34,13 +34,9 @@ from nerfloom.kernels.triton_backend import later
 
 
 def distance_network_reference(
-    positions: Tensor,
-    table: Tensor,
-    first: Tensor,
-    second: Tensor,
-    layout: HashGridLayout,
+    positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout,
     deferred: TableGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Compute `distance_network` in PyTorch, for any device and float type, with derivatives of any order.
 
     `positions`, `table`, `first`, `second`, `layout` and the result are as there; `deferred` is not used.
@@ -49,13 +45,9 @@ def distance_network_reference(
 
 
 def _with_gradient(
-    look_up: Callable[[Tensor, Tensor, HashGridLayout], Tensor],
-    positions: Tensor,
-    table: Tensor,
-    first: Tensor,
-    second: Tensor,
-    layout: HashGridLayout,
-) -> Tensor:
+    look_up: Callable[[Tensor, Tensor, HashGridLayout], Tensor], positions: Tensor, table: Tensor, first: Tensor,
+    second: Tensor, layout: HashGridLayout,
+) -> Tensor:  # fmt: skip
     """Compute `distance_network` by autograd through a form of the grid with the needed derivatives."""
     learns = torch.is_grad_enabled()
     # Not in bfloat16: its 8 bits are too few for distances near the surface.
@@ -68,13 +60,9 @@ def _with_gradient(
 
 
 def distance_network(
-    positions: Tensor,
-    table: Tensor,
-    first: Tensor,
-    second: Tensor,
-    layout: HashGridLayout,
+    positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout,
     deferred: TableGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     """Return the outputs of a network on a hash grid, and the gradient of the first one by the position.
 
     The compiled form has the gradients of both by table and network. Positions that require a gradient take the
@@ -131,26 +119,18 @@ DISTANCE_NETWORK.implementation(TRITON, fits=_fits)(later("surfaces.distance_tri
 
 @DISTANCE_NETWORK.implementation(FEW_OPERATIONS, types=None, order=torch.inf)
 def _few_operations(
-    positions: Tensor,
-    table: Tensor,
-    first: Tensor,
-    second: Tensor,
-    layout: HashGridLayout,
+    positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout,
     deferred: TableGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     with derivatives(2):  # a loss on the gradient of the distance needs the grid's second derivatives
         return _with_gradient(hash_grid, positions, table, first, second, layout)
 
 
 @DISTANCE_NETWORK.implementation(CPP, fits=_fits)
 def _compiled(
-    positions: Tensor,
-    table: Tensor,
-    first: Tensor,
-    second: Tensor,
-    layout: HashGridLayout,
+    positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout,
     deferred: TableGradient | None = None,
-) -> Tensor:
+) -> Tensor:  # fmt: skip
     contiguous = positions.contiguous(), table.contiguous(), first.contiguous(), second.contiguous()
     return _DistanceNetwork.apply(*contiguous, layout, deferred)
 
@@ -160,14 +140,9 @@ class _DistanceNetwork(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any,
-        positions: Tensor,
-        table: Tensor,
-        first: Tensor,
-        second: Tensor,
-        layout: HashGridLayout,
+        ctx: Any, positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout,
         deferred: TableGradient | None,
-    ) -> Tensor:
+    ) -> Tensor:  # fmt: skip
         ctx.save_for_backward(positions, table, first, second)
         ctx.layout, ctx.deferred = layout, deferred
 

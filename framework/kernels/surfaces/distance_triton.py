@@ -19,14 +19,15 @@ from nerfloom.kernels.grids.hash_grid_layout import HashGridLayout
 from nerfloom.kernels.grids.hash_grid_lookup import TableGradient
 from nerfloom.kernels.grids.hash_grid_triton import (
     BLOCK,
-    _along,
     _backward_positions,
     _end,
     _entry,
     _forward,
+    _level,
     _levels,
+    _place,
 )
-from nerfloom.kernels.triton_launch import blocks, launch
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, own_rows
 
 
 @triton.jit
@@ -38,26 +39,22 @@ def _slope(u, v, w, du, dv, dw, corner: tl.constexpr):
 
 
 @triton.jit
-def _cell(positions, directions, n, here, axis: tl.constexpr, resolution):
-    """Return the cell along an axis, the position in it, and the derivative of the latter along the direction."""
-    cell, fraction, inside = _along(positions, n, here, axis, resolution)
-    return cell, fraction, inside * tl.load(directions + n * 3 + axis, mask=here, other=0.0)
+def _moving(positions, directions, n, here, resolution):
+    """Return the cell along each axis, the position in it along each, and their derivatives along the directions."""
+    x, y, z, u, v, w, inside_x, inside_y, inside_z = _place(positions, n, here, resolution)
+    dx, dy, dz = load_three(directions + n * 3, here)
+    return x, y, z, u, v, w, inside_x * dx, inside_y * dy, inside_z * dz
 
 
 @triton.jit(do_not_specialize=["count"])
 def _tangent(
     positions, directions, table, levels, value, slope, count, num_levels, F: tl.constexpr, BLOCK: tl.constexpr
 ):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    n, here = own_rows(count, BLOCK)
     level = tl.program_id(1)
-    here = n < count
     f = tl.arange(0, F)
-    resolution = tl.load(levels + level * 4).to(tl.int32)
-    first, mask = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2)
-    dense = tl.load(levels + level * 4 + 3)
-    x, u, du = _cell(positions, directions, n, here, 0, resolution)
-    y, v, dv = _cell(positions, directions, n, here, 1, resolution)
-    z, w, dw = _cell(positions, directions, n, here, 2, resolution)
+    resolution, first, mask, dense = _level(levels, level)
+    x, y, z, u, v, w, du, dv, dw = _moving(positions, directions, n, here, resolution)
     values = tl.zeros([BLOCK, F], tl.float32)
     slopes = tl.zeros([BLOCK, F], tl.float32)
     for corner in tl.static_range(8):
@@ -75,16 +72,11 @@ def _tangent(
 def _backward_both(
     positions, directions, of_value, of_slope, levels, of_table, count, num_levels, F: tl.constexpr, BLOCK: tl.constexpr
 ):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    n, here = own_rows(count, BLOCK)
     level = tl.program_id(1)
-    here = n < count
     f = tl.arange(0, F)
-    resolution = tl.load(levels + level * 4).to(tl.int32)
-    first, mask = tl.load(levels + level * 4 + 1), tl.load(levels + level * 4 + 2)
-    dense = tl.load(levels + level * 4 + 3)
-    x, u, du = _cell(positions, directions, n, here, 0, resolution)
-    y, v, dv = _cell(positions, directions, n, here, 1, resolution)
-    z, w, dw = _cell(positions, directions, n, here, 2, resolution)
+    resolution, first, mask, dense = _level(levels, level)
+    x, y, z, u, v, w, du, dv, dw = _moving(positions, directions, n, here, resolution)
     at = (n[:, None] * num_levels + level) * F + f[None, :]
     by_value = tl.load(of_value + at, mask=here[:, None], other=0.0)
     by_slope = tl.load(of_slope + at, mask=here[:, None], other=0.0)
@@ -143,12 +135,7 @@ def distance_network(
     positions: Tensor, table: Tensor, first: Tensor, second: Tensor, layout: HashGridLayout,
     deferred: TableGradient | None,
 ) -> Tensor:  # fmt: skip
-    """Compute `nerfloom.kernels.surfaces.distance.distance_network`, for 1, 2, 4 or 8 features.
-
-    Autograd accumulates the gradient of the table: `deferred` is not used.
-
-    `positions`, `table`, `first`, `second` and `layout` are as there.
-    """
+    """Compute `distance_network` of `positions`, `table`, `first`, `second` and `layout`; `deferred` is not used."""
     with torch.autocast(positions.device.type, enabled=False):
         contiguous = positions.contiguous(), table.contiguous(), first.contiguous(), second.contiguous()
         return _DistanceNetwork.apply(*contiguous, layout)

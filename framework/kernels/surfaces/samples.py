@@ -113,22 +113,15 @@ def surface_samples(
 def surface_samples_reference(
     network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Compute `surface_samples` in PyTorch, for any device and float type, with derivatives of any order.
-
-    `network`, `sharpness`, `positions`, `first`, `intervals` and the result are as there.
-    """
+    """Compute `surface_samples` of `network`, `sharpness`, `positions`, `first` and `intervals` in PyTorch."""
     placed = (positions - first.centre) / first.size
     return stopped_samples(*first_distance(network, positions, first), network[:, 1:-3], placed, sharpness, intervals)
 
 
 def stopped_samples(
-    distances: Tensor,
-    gradients: Tensor,
-    features: Tensor,
-    placed: Tensor,
-    sharpness: Tensor,
+    distances: Tensor, gradients: Tensor, features: Tensor, placed: Tensor, sharpness: Tensor,
     intervals: Intervals | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return opacity or density at samples of any distance, and the inputs of their colour, as `surface_samples` does.
 
     Args:
@@ -175,26 +168,17 @@ def _compiled(
 ) -> tuple[Tensor, Tensor]:
     directions, lengths, annealing = intervals or (None, None, 1.0)
     rows = (None if each is None else each.contiguous() for each in (positions, directions, lengths))
-    return _Samples.apply(network.contiguous(), sharpness, first, annealing, *rows)
+    return _Samples.apply(first, annealing, network.contiguous(), sharpness, *rows)
 
 
 class _Samples(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        network: Tensor,
-        sharpness: Tensor,
-        first: FirstShape,
-        annealing: float,
-        positions: Tensor,
-        directions: Tensor | None,
-        lengths: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
-        ctx.save_for_backward(network, sharpness, positions, directions, lengths)
+    def forward(ctx: Any, first: FirstShape, annealing: float, network: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(network, *rest)
         ctx.first, ctx.annealing = first, annealing
         count, width = network.shape
         stopping, features = network.new_empty(count), network.new_empty(count, PLACED + width - 4)
-        arguments = _arguments(network, sharpness, first, annealing, positions, directions, lengths)
+        arguments = _arguments(first, annealing, network, *rest)
         _samples(*arguments, stopping.data_ptr(), features.data_ptr(), native.threads())
         ctx.set_materialize_grads(False)
         return stopping, features
@@ -202,28 +186,23 @@ class _Samples(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, of_stopping: Tensor | None, of_features: Tensor | None) -> tuple[Tensor | None, ...]:
-        network, sharpness, *rows = ctx.saved_tensors
+        tensors = network, sharpness, *_ = ctx.saved_tensors
         of_stopping, of_features = (None if x is None else x.contiguous() for x in (of_stopping, of_features))
         of_network, of_sharpness, count = torch.empty_like(network), torch.zeros_like(sharpness), len(network)
         shapes = (count,), (count, PLACED + network.shape[1] - 4)
         _samples_backward(
-            *_arguments(network, sharpness, ctx.first, ctx.annealing, *rows),
+            *_arguments(ctx.first, ctx.annealing, *tensors),
             None if of_stopping is None else native.pointer(of_stopping, "the gradient", shapes[0]),
             None if of_features is None else native.pointer(of_features, "the features' gradient", shapes[1]),
             of_network.data_ptr(), of_sharpness.data_ptr(), native.threads(),
         )  # fmt: skip
-        return of_network, of_sharpness, *[None] * 5
+        return None, None, of_network, of_sharpness, None, None, None
 
 
 def _arguments(
-    network: Tensor,
-    sharpness: Tensor,
-    first: FirstShape,
-    annealing: float,
-    positions: Tensor,
-    directions: Tensor | None,
-    lengths: Tensor | None,
-) -> tuple[Any, ...]:
+    first: FirstShape, annealing: float, network: Tensor, sharpness: Tensor, positions: Tensor,
+    directions: Tensor | None, lengths: Tensor | None,
+) -> tuple[Any, ...]:  # fmt: skip
     """Return the leading arguments that both compiled functions have."""
     count = len(network)
     return (

@@ -13,31 +13,32 @@ import triton.language as tl
 from torch import Tensor
 
 from nerfloom.kernels.surfaces.samples import PLACED, SHORTEST, FirstShape, Intervals
-from nerfloom.kernels.triton_launch import blocks, launch, on_device, opacity_of
+from nerfloom.kernels.triton_launch import blocks, launch, load_three, on_device, opacity_of, own_rows, store_three
 
 BLOCK = 128
 """Samples per program."""
 
 
 @triton.jit
-def _offset(positions, centre, n, here, axis: tl.constexpr):
-    return tl.load(positions + n * 3 + axis, mask=here, other=0.0) - tl.load(centre + axis)
+def _distance(network, positions, centre, size, radius, rounding, floor, n, here, stride):
+    """Return the offsets from the ball's centre, their lengths, whether the floor is nearer, and the distance."""
+    x, y, z = load_three(positions + n * 3, here)
+    height = x * tl.load(floor) + y * tl.load(floor + 1) + z * tl.load(floor + 2) - tl.load(floor + 3)
+    x, y, z = x - tl.load(centre), y - tl.load(centre + 1), z - tl.load(centre + 2)
+    far = tl.sqrt(x * x + y * y + z * z + rounding * rounding)
+    lower = height < far - radius
+    distance = tl.where(lower, height, far - radius) + size * tl.load(network + n * stride, mask=here, other=0.0)
+    return x, y, z, far, lower, distance
 
 
 @triton.jit
-def _height(positions, floor, n, here):
-    """Return the distance to the floor."""
-    height = tl.load(positions + n * 3, mask=here, other=0.0) * tl.load(floor)
-    height += tl.load(positions + n * 3 + 1, mask=here, other=0.0) * tl.load(floor + 1)
-    height += tl.load(positions + n * 3 + 2, mask=here, other=0.0) * tl.load(floor + 2)
-    return height - tl.load(floor + 3)
-
-
-@triton.jit
-def _along(network, n, here, stride, axis: tl.constexpr, offset, far, scale, size, floor, lower):
-    """Return the distance's derivative along an axis."""
-    slope = tl.load(network + n * stride + stride - 3 + axis, mask=here, other=0.0)
-    return tl.where(lower, tl.load(floor + axis), offset / far) + size * tl.load(scale + axis) * slope
+def _gradient(network, x, y, z, far, lower, scale, size, floor, n, here, stride):
+    """Return the gradient of the distance."""
+    along_x, along_y, along_z = load_three(network + n * stride + stride - 3, here)
+    along_x = tl.where(lower, tl.load(floor), x / far) + size * tl.load(scale) * along_x
+    along_y = tl.where(lower, tl.load(floor + 1), y / far) + size * tl.load(scale + 1) * along_y
+    along_z = tl.where(lower, tl.load(floor + 2), z / far) + size * tl.load(scale + 2) * along_z
+    return along_x, along_y, along_z
 
 
 @triton.jit
@@ -62,23 +63,13 @@ def _forward(
     network, positions, directions, lengths, sharpness, annealing, centre, scale, size, radius, rounding, floor,
     stopping, features, count, D: tl.constexpr, INTERVALS: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     s, annealing = tl.load(sharpness), tl.load(annealing)
-    x = _offset(positions, centre, n, here, 0)
-    y = _offset(positions, centre, n, here, 1)
-    z = _offset(positions, centre, n, here, 2)
-    far = tl.sqrt(x * x + y * y + z * z + rounding * rounding)
-    height = _height(positions, floor, n, here)
-    lower = height < far - radius
-    distance = tl.where(lower, height, far - radius) + size * tl.load(network + n * (D + 3), mask=here, other=0.0)
-    along_x = _along(network, n, here, D + 3, 0, x, far, scale, size, floor, lower)
-    along_y = _along(network, n, here, D + 3, 1, y, far, scale, size, floor, lower)
-    along_z = _along(network, n, here, D + 3, 2, z, far, scale, size, floor, lower)
+    x, y, z, far, lower, distance = _distance(network, positions, centre, size, radius, rounding, floor, n, here, D + 3)
+    along_x, along_y, along_z = _gradient(network, x, y, z, far, lower, scale, size, floor, n, here, D + 3)
     if INTERVALS:
-        cosine = along_x * tl.load(directions + n * 3, mask=here, other=0.0)
-        cosine += along_y * tl.load(directions + n * 3 + 1, mask=here, other=0.0)
-        cosine += along_z * tl.load(directions + n * 3 + 2, mask=here, other=0.0)
+        to_x, to_y, to_z = load_three(directions + n * 3, here)
+        cosine = along_x * to_x + along_y * to_y + along_z * to_z
         half = _half(cosine, tl.load(lengths + n, mask=here, other=0.0), annealing)
         inside, _ = _logistic(s * (distance - half))
         value = inside * opacity_of(2 * s * half)
@@ -87,12 +78,8 @@ def _forward(
         value = s * tl.where(distance > 0, outside, 1 - outside)
     tl.store(stopping + n, value, mask=here)
     to = features + n * (5 + D)
-    tl.store(to, along_x, mask=here)
-    tl.store(to + 1, along_y, mask=here)
-    tl.store(to + 2, along_z, mask=here)
-    tl.store(to + 3, x / size, mask=here)
-    tl.store(to + 4, y / size, mask=here)
-    tl.store(to + 5, z / size, mask=here)
+    store_three(to, along_x, along_y, along_z, here)
+    store_three(to + 3, x / size, y / size, z / size, here)
     k = tl.arange(0, WIDTH)
     some = here[:, None] & (k < D - 1)[None, :]
     rest = tl.load(network + n[:, None] * (D + 3) + 1 + k[None, :], mask=some, other=0.0)
@@ -105,28 +92,16 @@ def _backward(
     of_stopping, of_features, of_network, of_sharpness, count, D: tl.constexpr, INTERVALS: tl.constexpr,
     WIDTH: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     s, annealing = tl.load(sharpness), tl.load(annealing)
-    x = _offset(positions, centre, n, here, 0)
-    y = _offset(positions, centre, n, here, 1)
-    z = _offset(positions, centre, n, here, 2)
-    far = tl.sqrt(x * x + y * y + z * z + rounding * rounding)
-    height = _height(positions, floor, n, here)
-    lower = height < far - radius
-    distance = tl.where(lower, height, far - radius) + size * tl.load(network + n * (D + 3), mask=here, other=0.0)
+    x, y, z, far, lower, distance = _distance(network, positions, centre, size, radius, rounding, floor, n, here, D + 3)
     grad = tl.load(of_stopping + n, mask=here, other=0.0)
-    by_x = tl.load(of_features + n * (5 + D), mask=here, other=0.0)
-    by_y = tl.load(of_features + n * (5 + D) + 1, mask=here, other=0.0)
-    by_z = tl.load(of_features + n * (5 + D) + 2, mask=here, other=0.0)
+    by_x, by_y, by_z = load_three(of_features + n * (5 + D), here)
     if INTERVALS:
-        to_x = tl.load(directions + n * 3, mask=here, other=0.0)
-        to_y = tl.load(directions + n * 3 + 1, mask=here, other=0.0)
-        to_z = tl.load(directions + n * 3 + 2, mask=here, other=0.0)
+        to_x, to_y, to_z = load_three(directions + n * 3, here)
         length = tl.load(lengths + n, mask=here, other=0.0)
-        cosine = _along(network, n, here, D + 3, 0, x, far, scale, size, floor, lower) * to_x
-        cosine += _along(network, n, here, D + 3, 1, y, far, scale, size, floor, lower) * to_y
-        cosine += _along(network, n, here, D + 3, 2, z, far, scale, size, floor, lower) * to_z
+        along_x, along_y, along_z = _gradient(network, x, y, z, far, lower, scale, size, floor, n, here, D + 3)
+        cosine = along_x * to_x + along_y * to_y + along_z * to_z
         half = _half(cosine, length, annealing)
         inside, outside = _logistic(s * (distance - half))
         fall = 2 * s * half
@@ -146,9 +121,8 @@ def _backward(
     tl.atomic_add(of_sharpness, tl.sum(tl.where(here, grad * by_s, 0.0), 0), sem="relaxed")
     to = of_network + n * (D + 3)
     tl.store(to, size * grad * by_distance, mask=here)
-    tl.store(to + D, size * tl.load(scale) * by_x, mask=here)
-    tl.store(to + D + 1, size * tl.load(scale + 1) * by_y, mask=here)
-    tl.store(to + D + 2, size * tl.load(scale + 2) * by_z, mask=here)
+    by_x, by_y, by_z = size * tl.load(scale) * by_x, size * tl.load(scale + 1) * by_y, size * tl.load(scale + 2) * by_z
+    store_three(to + D, by_x, by_y, by_z, here)
     k = tl.arange(0, WIDTH)
     some = here[:, None] & (k < D - 1)[None, :]
     rest = tl.load(of_features + n[:, None] * (5 + D) + 6 + k[None, :], mask=some, other=0.0)
@@ -197,10 +171,7 @@ def _constants(outputs: int, rows: Any) -> dict[str, Any]:
 def surface_samples(
     network: Tensor, sharpness: Tensor, positions: Tensor, first: FirstShape, intervals: Intervals | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Compute `nerfloom.kernels.surfaces.samples.surface_samples`.
-
-    `network`, `sharpness`, `positions`, `first` and `intervals` are as there.
-    """
+    """Compute `samples.surface_samples` of `network`, `sharpness`, `positions`, `first` and `intervals`."""
     rows, annealing = [positions.contiguous()], 1.0
     if intervals is not None:
         rows += [intervals.directions.contiguous(), intervals.lengths.contiguous()]
@@ -211,9 +182,7 @@ def surface_samples(
 @triton.jit
 def _normal(features, n, here, F: tl.constexpr, SHORTEST: tl.constexpr):
     """Return a unit vector, and its length; 0 and 1 where it is too short."""
-    x = tl.load(features + n * F, mask=here, other=0.0)
-    y = tl.load(features + n * F + 1, mask=here, other=0.0)
-    z = tl.load(features + n * F + 2, mask=here, other=0.0)
+    x, y, z = load_three(features + n * F, here)
     largest = tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z))
     unit = tl.where(largest < SHORTEST, 1.0, largest)
     x, y, z = x / unit, y / unit, z / unit
@@ -225,12 +194,9 @@ def _normal(features, n, here, F: tl.constexpr, SHORTEST: tl.constexpr):
 
 @triton.jit(do_not_specialize=["count"])
 def _unit(features, out, count, F: tl.constexpr, WIDTH: tl.constexpr, SHORTEST: tl.constexpr, BLOCK: tl.constexpr):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     x, y, z, _ = _normal(features, n, here, F, SHORTEST)
-    tl.store(out + n * F, x, mask=here)
-    tl.store(out + n * F + 1, y, mask=here)
-    tl.store(out + n * F + 2, z, mask=here)
+    store_three(out + n * F, x, y, z, here)
     k = tl.arange(0, WIDTH)
     at, some = n[:, None] * F + k[None, :], here[:, None] & ((k >= 3) & (k < F))[None, :]
     tl.store(out + at, tl.load(features + at, mask=some, other=0.0), mask=some)
@@ -240,17 +206,13 @@ def _unit(features, out, count, F: tl.constexpr, WIDTH: tl.constexpr, SHORTEST: 
 def _unit_backward(
     features, grad, out, count, F: tl.constexpr, WIDTH: tl.constexpr, SHORTEST: tl.constexpr, BLOCK: tl.constexpr
 ):
-    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = n < count
+    n, here = own_rows(count, BLOCK)
     x, y, z, length = _normal(features, n, here, F, SHORTEST)
-    by_x = tl.load(grad + n * F, mask=here, other=0.0)
-    by_y = tl.load(grad + n * F + 1, mask=here, other=0.0)
-    by_z = tl.load(grad + n * F + 2, mask=here, other=0.0)
+    by_x, by_y, by_z = load_three(grad + n * F, here)
     along = x * by_x + y * by_y + z * by_z
+    by_x, by_y, by_z = (by_x - along * x) / length, (by_y - along * y) / length, (by_z - along * z) / length
     some = (x != 0) | (y != 0) | (z != 0)
-    tl.store(out + n * F, tl.where(some, (by_x - along * x) / length, 0.0), mask=here)
-    tl.store(out + n * F + 1, tl.where(some, (by_y - along * y) / length, 0.0), mask=here)
-    tl.store(out + n * F + 2, tl.where(some, (by_z - along * z) / length, 0.0), mask=here)
+    store_three(out + n * F, tl.where(some, by_x, 0.0), tl.where(some, by_y, 0.0), tl.where(some, by_z, 0.0), here)
     k = tl.arange(0, WIDTH)
     at, rest = n[:, None] * F + k[None, :], here[:, None] & ((k >= 3) & (k < F))[None, :]
     tl.store(out + at, tl.load(grad + at, mask=rest, other=0.0), mask=rest)

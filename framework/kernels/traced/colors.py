@@ -19,6 +19,7 @@ from nerfloom.kernels.compositing.density import composite
 from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.encodings.spherical_harmonics import spherical_harmonics
 from nerfloom.kernels.march.waves import March
+from nerfloom.kernels.math import at_least_float32
 from nerfloom.kernels.networks.mlp import NETWORK, mlp, multiplies_bf16
 from nerfloom.kernels.traced.trace import DENSITY, PATH, GridDensity, arguments, is_compiled, network_arguments, trace
 
@@ -62,17 +63,13 @@ def traced_colors(marched: March, density: GridDensity, color: GridColor, backgr
 
 
 def traced_colors_reference(marched: March, density: GridDensity, color: GridColor, background: Tensor) -> TracedColors:
-    """Compute `traced_colors` in PyTorch and single operations, on any device.
-
-    `marched`, `density`, `color` and `background` are as in `traced_colors`.
-    """
+    """Compute `traced_colors` of `marched`, `density`, `color` and `background` in PyTorch, in single operations."""
     traced, rays = trace(marched, density), marched.rays
     inputs = [traced.features]
     if color.bands:
         inputs.append(spherical_harmonics(rays.directions.index_select(0, traced.owners), color.bands))
-    rgb = mlp(inputs, color.weights, "sigmoid")
+    rgb = at_least_float32(mlp(inputs, color.weights, "sigmoid"))
     samples = Samples(traced.t_starts, traced.t_ends, traced.offsets, owners=traced.owners, longest=traced.longest)
-    rgb = rgb if rgb.dtype == torch.float64 else rgb.float()
     sums = composite(samples, traced.sigma, rgb, background, rays.fars)
     return TracedColors(sums.color, sums.opacity, sums.moment, sums.median, len(samples))
 

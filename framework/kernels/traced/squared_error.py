@@ -13,8 +13,8 @@ paths (Arvo and Kirk 1990, "Particle transport and image synthesis").
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from torch import Tensor
 from nerfloom.kernels import native, result_cache
 from nerfloom.kernels.dispatch import CPP, Operation
 from nerfloom.kernels.grids.hash_grid import hash_grid
+from nerfloom.kernels.known_gradient import KnownGradient
 from nerfloom.kernels.march.waves import March
 from nerfloom.kernels.networks.mlp import multiplies_bf16
 from nerfloom.kernels.traced.colors import GridColor, has_compiled_networks, traced_colors_reference
@@ -119,23 +120,8 @@ def _compiled(
     _take(total, unit.data_ptr(), by_encoded.data_ptr(), native.threads())
     with result_cache.given(hash_grid=by_encoded):  # the values do not matter, only the table's gradient
         encoded = hash_grid(unit, density.table, density.layout, density.deferred)
-    known = (by_encoded, *grads[0], *grads[1])
-    return TracedError(_Known.apply(error, known, encoded, *networks[0], *networks[1]), rgb, int(samples))
-
-
-class _Known(torch.autograd.Function):
-    """A value with known gradients."""
-
-    @staticmethod
-    def forward(ctx: Any, value: Tensor, grads: Sequence[Tensor], *inputs: Tensor) -> Tensor:
-        ctx.grads = grads
-        return value.clone()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        factor = float(grad)
-        return None, None, *(each if factor == 1 else each * factor for each in ctx.grads)
+    computed = (error, by_encoded, *grads[0], *grads[1])
+    return TracedError(KnownGradient.apply(computed, encoded, *networks[0], *networks[1]), rgb, int(samples))
 
 
 _traced_error: Callable[..., int] = native.Function("traced_error", PATH + DENSITY + "ipipipppqfqpppppi", "q")

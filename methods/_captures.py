@@ -43,7 +43,6 @@ class RefinedConfig(RayConfig):
     """Settings of a method that may refine the poses of its training cameras."""
 
     RANGES: ClassVar[dict[str, Range]] = {"camera_learning_rate": AT_LEAST_0}
-    """Allowed range of each numeric setting."""
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
     """Refinement of the training cameras' poses. auto: SO3xR3 if a device tracked them, otherwise off. A method that
     learns a density needs --sampler proposal for it; with an occupancy grid, auto is off."""
@@ -61,7 +60,6 @@ class CaptureConfig(ProposedConfig):
     """Settings of a method for captures."""
 
     RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0}
-    """Allowed range of each numeric setting."""
     contraction: Auto[bool] = AUTO
     """Whether to contract space outside the box. auto: in unbounded scenes."""
     distortion_loss_mult: Auto[float] = AUTO

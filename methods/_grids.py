@@ -22,9 +22,7 @@ class GridsConfig(HashGridConfig):
     """Settings of the hash grids that `--encoding hash-grid` selects."""
 
     RANGES: ClassVar[dict[str, Range]] = {"grid_learning_rate": AT_LEAST_0}
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"grid_width": GRID_WIDTH}
-    """Settings of earlier versions."""
     grid_learning_rate: float = 1e-2
     """Initial learning rate of the hash grids and of the networks on them (hash-grid)."""
 

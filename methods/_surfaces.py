@@ -108,14 +108,12 @@ class SurfaceConfig(
         "step_widths": AT_LEAST_0,
         "open_levels_until": (0, 1),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {
         "sharpness_learning_rate": SHARPNESS_RATE,
         "color_loss": "squared",
         "curvature_from": 0.0,
         "curvature_until": 0.4,
     }
-    """Settings of earlier versions."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the papers' networks, of 8 layers for the distance and 4 for
     the colour, for GPUs."""

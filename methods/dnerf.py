@@ -62,13 +62,11 @@ class DNeRFConfig(
         "max_resolution": (1, MAX_RESOLUTION),
         "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {
         "deformation_width": lambda config: deformation_size(config)[0],
         "deformation_layers": lambda config: deformation_size(config)[1],
         "deformation_frequencies": lambda config: deformation_size(config)[2],
     }
-    """Settings of earlier versions."""
     variant: Literal["d-nerf", "t-nerf"] = "d-nerf"
     """d-nerf: a canonical field and a deformation network. t-nerf: one network of position and time."""
     canonical: Literal["network", "hash-grid"] = "network"

@@ -54,7 +54,6 @@ class GaussianSplattingConfig(SplattingConfig):
         "field_depth_mult": AT_LEAST_0,
         "ssim_weight": (0, 1),
     }
-    """Allowed range of each numeric setting."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; the absolute error has the weight 1 - ssim_weight."""
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO

@@ -77,7 +77,6 @@ class InstantNGPConfig(
         "detail": (1, 64),
         "hidden_width": (1, 2**14),
     }
-    """Allowed range of each numeric setting."""
     max_resolution: Auto[int] = AUTO
     """Cells per axis at the finest level. auto: a power of two, at least `detail` cells per pixel."""
     detail: Auto[int] = AUTO

@@ -57,7 +57,6 @@ class KiloNeRFConfig(
         "distill_steps": (0, 1e7),
         "distill_share": (0, 1),
     }
-    """Allowed range of each numeric setting."""
     network_resolution: int = 8
     """Cells along the longest edge of the box, each with a network of its own."""
     hidden_width: int = 32

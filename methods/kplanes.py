@@ -66,7 +66,6 @@ class KPlanesConfig(
         "time_smoothness": AT_LEAST_0,
         "time_sparsity": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     decoder: Literal["hybrid", "explicit"] = "hybrid"
     """hybrid: two small networks. explicit: density linear in the features, and a learnt colour basis."""
     base_resolution: int = 64

@@ -42,7 +42,6 @@ class MipNeRFConfig(
         "position_frequencies": (1, MAX_FREQUENCIES),
         "direction_frequencies": (0, MAX_FREQUENCIES),
     }
-    """Allowed range of each numeric setting."""
     num_layers: int = 8
     """Layers before the density output."""
     hidden_width: int = 256

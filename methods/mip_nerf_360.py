@@ -79,12 +79,10 @@ class MipNeRF360Config(
         "direction_frequencies": (0, MAX_FREQUENCIES),
         "distortion_loss_mult": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {
         "proposal_width": lambda config: proposal_size(config)[0],
         "proposal_layers": lambda config: proposal_size(config)[1],
     }
-    """Settings of earlier versions."""
     encoding: Auto[Literal["integrated", "hash-grid"]] = AUTO
     """integrated: the paper's networks. hash-grid: hash grids with small networks. auto: hash-grid on a CPU."""
     distortion_loss_mult: Auto[float] = AUTO

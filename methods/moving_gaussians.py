@@ -41,9 +41,7 @@ class MovingGaussiansConfig(GaussianSplattingConfig, noise=0.0, opacity_penalty=
         "start_duration": DURATIONS,
         "min_duration": DURATIONS,
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"moment_rate": MOMENT_RATE, "duration_rate": DURATION_RATE}
-    """Settings of earlier versions."""
     velocity_rate: float = 1.6e-3
     """Learning rate of velocities, in sizes of the scene for the time from 0 to 1, before --rate-factor."""
     start_duration: float = 0.1

@@ -71,7 +71,6 @@ class NerfWConfig(
         "least_uncertainty": (1e-4, 1e4),
         "transient_density_mult": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     encoding: Literal["hash-grid", "planes", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. planes: the same on the feature planes of K-Planes. frequency: the
     paper's networks, of 8 layers of 256 features."""

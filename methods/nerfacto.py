@@ -72,7 +72,6 @@ class NerfactoConfig(
     RANGES: ClassVar[dict[str, Range]] = {
         "hidden_width": (1, 2**14),
     }
-    """Allowed range of each numeric setting."""
     predict_normals: bool = False
     """Whether to predict normals, which are smoother than normals from the density's gradient. --directional reflected
     always does."""

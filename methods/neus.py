@@ -28,7 +28,6 @@ class NeuSConfig(SurfaceConfig):
     """Settings of neus."""
 
     RANGES: ClassVar[dict[str, Range]] = {"anneal_slope_until": (0, 1)}
-    """Allowed range of each numeric setting."""
     anneal_slope_until: float = 0.5
     """Fraction of the budget until the annealing of the slope ends (`surface_opacity`)."""
 

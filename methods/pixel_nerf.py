@@ -65,9 +65,7 @@ class PixelNeRFConfig(
         "position_frequencies": (0, MAX_FREQUENCIES),
         "encoder_widths": (1, 2**14),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"num_view_blocks": BLOCKS_BEFORE}
-    """Settings of earlier versions."""
     num_coarse_samples: int = 32
     """Stratified intervals per ray (64 in the paper)."""
     num_fine_samples: int = 32

@@ -62,7 +62,6 @@ class RefNeRFConfig(
         "position_frequencies": (1, MAX_FREQUENCIES),
         "open_levels_until": (0, 1),
     }
-    """Allowed range of each numeric setting."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the paper's networks of 8 layers, for GPUs."""
     max_resolution: Auto[int] = AUTO

@@ -66,9 +66,7 @@ class TensoRFConfig(
         "total_variation": AT_LEAST_0,
         "hidden_width": (1, 2**14),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"network_learning_rate": NETWORK_RATE}
-    """Settings of earlier versions."""
     decomposition: Literal["vm", "cp"] = "vm"
     """vm: planes and lines. cp: lines only, which take less than 4 MB and learn more slowly."""
     density_components: Auto[int] = AUTO

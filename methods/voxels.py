@@ -75,9 +75,7 @@ class VoxelsConfig(
         "prune_weight": (0, 1),
         "total_variation": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"silhouette_pixels": True, "density_rate": DENSITY_RATE}
-    """Settings of earlier versions."""
     resolution: Auto[int] = AUTO
     """Cells along the longest edge of the box that silhouettes leave, at the end of training. auto: chosen from the
     images and the training time."""

@@ -67,9 +67,7 @@ class ZipNeRFConfig(
         "proposal_log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
         "hidden_width": (1, 2**14),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"power_ladder": POWER_LADDER, "num_proposal_levels": PROPOSAL_LEVELS}
-    """Settings of earlier versions."""
     changing_light = "affine"
     interlevel_blurs: tuple[float, ...] = (0.03, 0.003)
     """Radius of the box filter on the samples' histogram in each proposal's loss, in normalised distance."""

@@ -54,7 +54,6 @@ class PredictedNormalsConfig(TrainConfig):
     """Weights of the penalties on predicted normals (`nerfloom.losses.normals`)."""
 
     RANGES: ClassVar[dict[str, Range]] = {"normal_loss_mult": AT_LEAST_0, "orientation_loss_mult": AT_LEAST_0}
-    """Allowed range of each numeric setting."""
     normal_loss_mult: float = 3e-3
     """Weight of the difference between predicted normals and the density's normals."""
     orientation_loss_mult: float = 0.1

@@ -53,9 +53,7 @@ class SamplingConfig(RayConfig):
         "num_proposal_samples": (1, 2**14),
         "num_nerf_samples": (1, 2**14),
     }
-    """Minimum and maximum of these settings."""
     GONE: ClassVar[dict[str, Any]] = {"silhouette_pixels": True, "nested_resolution": NESTED_CELLS}
-    """Settings of earlier versions."""
     sampler: Auto[Literal["occupancy", "proposal"]] = AUTO
     """occupancy: march through the occupied cells of the box, or of nested boxes if the scene may extend beyond the
     box. proposal: small density fields choose the samples. auto: proposal if the scene may extend beyond the box,
@@ -98,7 +96,6 @@ class HierarchicalConfig(SamplingConfig):
     """Settings of a method that can also be sampled hierarchically, with a coarse and a fine field, as in NeRF."""
 
     RANGES: ClassVar[dict[str, Range]] = {"num_coarse_samples": (MIN_COARSE, 2**14), "num_fine_samples": (1, 2**14)}
-    """Minimum and maximum of these settings."""
     sampler: Auto[Literal["hierarchical", "occupancy", "proposal"]] = AUTO  # type: ignore[assignment]
     """hierarchical: a coarse and a fine field. occupancy: one field and an occupancy grid. proposal: one field, and
     small density fields that choose the samples in all of space, contracted. auto: proposal if the scene may extend

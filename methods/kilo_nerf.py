@@ -83,9 +83,6 @@ class ViewDependence(LossTerm):
     in the step count, because the optimiser updates no others.
     """
 
-    def __init__(self) -> None:
-        super().__init__("view_dependence", "view_dependence_mult")
-
     def __call__(self, shown: RenderedBatch) -> Tensor:
         field, samples = shown.model.field, shown.rendered.samples
         assert isinstance(field, NetworkGrid)
@@ -97,7 +94,7 @@ class ViewDependence(LossTerm):
 class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
     """A model that starts from a teacher's field, if there is a teacher."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, ViewDependence())
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, ViewDependence("view_dependence", "view_dependence_mult"))
 
     def __init__(
         self, config: KiloNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer

@@ -125,9 +125,6 @@ class PlaneRegularity(LossTerm):
     can be captured.
     """
 
-    def __init__(self) -> None:
-        super().__init__("planes")
-
     def __call__(self, shown: RenderedBatch) -> dict[str, Tensor]:
         model, config, zero = shown.model, shown.model.config, shown.rendered.rgb.new_zeros(())
         assert isinstance(model.field, BoxField)
@@ -165,7 +162,7 @@ class PlaneRegularity(LossTerm):
 class KPlanes(RayModel[KPlanesConfig], LearnsMotion, plain=True):
     """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, PlaneRegularity(), *FEW_IMAGES)
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, PlaneRegularity("planes"), *FEW_IMAGES)
     steps_repeat = True
 
 

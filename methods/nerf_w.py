@@ -85,9 +85,6 @@ class NerfWConfig(
 class DoubtedError(LossTerm):
     """Error of colours in units of their uncertainty."""
 
-    def __init__(self) -> None:
-        super().__init__("rgb")
-
     def __call__(self, shown: RenderedBatch) -> Tensor:
         pixels, batch = shown.pixels, shown.batch
         least = shown.model.config.least_uncertainty
@@ -97,9 +94,6 @@ class DoubtedError(LossTerm):
 class TransientDensity(LossTerm):
     """Mean transient density, per half edge of the box: NeRF-W, equation 13, in the unit of `doubted_error`."""
 
-    def __init__(self) -> None:
-        super().__init__("transient", "transient_density_mult")
-
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         density = shown.rendered.extras.get("transient_density")  # None for the views of a teacher
         unit = 2 * shown.model.config.least_uncertainty**2 * half_edge(shown.model.scene.box)
@@ -108,9 +102,6 @@ class TransientDensity(LossTerm):
 
 class PlaneVariation(LossTerm):
     """Total variation of feature planes: K-Planes, equation 4; from a random band of rows of each, without bias."""
-
-    def __init__(self) -> None:
-        super().__init__("planes", PLANE_VARIATION)
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return bool(model.config.encoding == "planes")
@@ -123,7 +114,14 @@ class PlaneVariation(LossTerm):
 class NerfW(RefinedModel[NerfWConfig], plain=True):
     """A model that gives less weight to an image where the others disagree with it."""
 
-    losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion(), PlaneVariation())
+    losses = (
+        DoubtedError("rgb"),
+        TransientDensity("transient", "transient_density_mult"),
+        SamplerLoss(),
+        *KNOWN_DISTANCES,
+        Distortion(),
+        PlaneVariation("planes", PLANE_VARIATION),
+    )
     renderer: TransientRenderer
 
     def lit(self, rendered: Rendered, rays: Rays, background: Tensor) -> Rendered:

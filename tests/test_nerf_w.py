@@ -234,11 +234,11 @@ def test_planes_have_a_vertex_for_each_pixel_and_their_variation_counts() -> Non
     expected = torch.stack(steps).sum() / (2 * len(factors))
     batch = RenderedBatch(batch=None, rendered=None, model=model, step=0)  # type: ignore[arg-type]
     torch.manual_seed(0)
-    found = torch.stack([nerf_w.PlaneVariation()(batch).detach() for _ in range(50)]).mean()
+    found = torch.stack([nerf_w.PlaneVariation("planes")(batch).detach() for _ in range(50)]).mean()
     assert float(found) == pytest.approx(float(expected), rel=0.05)  # a band of one row has no steps
-    assert nerf_w.PlaneVariation().applies(batch.batch, model)
+    assert nerf_w.PlaneVariation("planes").applies(batch.batch, model)
     model.config = dataclasses.replace(config, encoding="hash-grid")
-    assert not nerf_w.PlaneVariation().applies(batch.batch, model)
+    assert not nerf_w.PlaneVariation("planes").applies(batch.batch, model)
 
 
 @pytest.mark.slow

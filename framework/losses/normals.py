@@ -26,17 +26,6 @@ SHARE = 1 / 16
 """`PredictedNormals` uses at most this fraction of the samples, on average."""
 
 
-class NormalPenalty(LossTerm):
-    """Mean over rays of a penalty of `normal_penalties`, "normals" or "orientation", from the renderer's extras."""
-
-    def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        rendered, key = shown.rendered, f"{self.name}_penalty"
-        if not len(rendered.rgb):
-            return None
-        penalty: Tensor = rendered.extras[key].mean()
-        return penalty
-
-
 class PredictedNormals(LossTerm):
     """Penalties on the predicted normals of reflected directions, in methods with `PredictedNormalsConfig`.
 
@@ -44,9 +33,6 @@ class PredictedNormals(LossTerm):
     visible normals that face away from the camera. Each is a mean over rays of sums over samples. The sums are
     estimated without bias from samples that are drawn at random by their weights.
     """
-
-    def __init__(self) -> None:
-        super().__init__("normals")
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         config = model.config
@@ -65,8 +51,7 @@ class PredictedNormals(LossTerm):
         return "normals are compared at random samples" if config.directional == "reflected" else None
 
 
-PREDICTED_NORMALS = PredictedNormals()
-"""The term."""
+PREDICTED_NORMALS = PredictedNormals("normals")
 
 
 def penalties(rendered: Rendered, rays: Rays, field: Field) -> dict[str, Tensor]:

@@ -22,6 +22,7 @@ from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
 from nerfloom.base.decisions import Choice, fill, is_open
 from nerfloom.base.optimised import Optimised
 from nerfloom.cameras.refinement import POSE_REASONS, PoseRefinement
+from nerfloom.encodings.hash_grid import HashGridConfig
 from nerfloom.samplers.choice import PROPOSAL_SAMPLES, SamplingConfig, decide_samples, sampler_choice, samples_choices
 
 DISTORTION = 2e-3
@@ -56,8 +57,18 @@ class ProposedConfig(RefinedConfig, SamplingConfig, num_proposal_samples=AUTO, n
 
 
 @dataclass(frozen=True)
-class CaptureConfig(ProposedConfig):
-    """Settings of a method for captures."""
+class CaptureConfig(
+    HashGridConfig,
+    ProposedConfig,
+    num_rays_per_batch=2_048,
+    learning_rate=1e-2,
+    lr_schedule="hold-exponential",
+    lr_final=0.02,
+    adam_beta2=0.99,
+    adam_eps=1e-15,
+    eval_num_rays_per_chunk=4_096,
+):
+    """Settings of a method for captures on a hash grid."""
 
     RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0}
     contraction: Auto[bool] = AUTO

@@ -73,10 +73,7 @@ class InstantNGPConfig(
 ):
     """Settings of instant-ngp."""
 
-    RANGES: ClassVar[dict[str, Range]] = {
-        "detail": (1, 64),
-        "hidden_width": (1, 2**14),
-    }
+    RANGES: ClassVar[dict[str, Range]] = {"detail": (1, 64), "hidden_width": (1, 2**14)}
     max_resolution: Auto[int] = AUTO
     """Cells per axis at the finest level. auto: a power of two, at least `detail` cells per pixel."""
     detail: Auto[int] = AUTO

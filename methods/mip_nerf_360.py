@@ -21,6 +21,7 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.integrated import IntegratedEncoding, icosahedron_directions
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
+from nerfloom.fields.nerf import NetworkConfig
 from nerfloom.fields.sized import SizedDensity, SizedField
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.functions import charbonnier
@@ -57,6 +58,7 @@ PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
 class MipNeRF360Config(
     GridsConfig,
     ProposedConfig,
+    NetworkConfig,
     max_num_iterations=250_000,
     num_rays_per_batch=2_048,
     learning_rate=2e-3,
@@ -73,10 +75,7 @@ class MipNeRF360Config(
     """
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "num_layers": (3, 64),
-        "hidden_width": (2, 2**14),
         "position_frequencies": (1, MAX_FREQUENCIES),
-        "direction_frequencies": (0, MAX_FREQUENCIES),
         "distortion_loss_mult": AT_LEAST_0,
     }
     GONE: ClassVar[dict[str, Any]] = {

@@ -18,7 +18,7 @@ from nerfloom import Decision, Method, Picture, PixelBatch, RayModel, Rays, Rend
 from nerfloom.base.config import AT_LEAST_0, Range, VectorConfig
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
-from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.planes import FeaturePlanes, resolutions_of, scales_for
 from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
@@ -49,21 +49,7 @@ SAMPLES = 2**15
 
 
 @dataclass(frozen=True)
-class NerfWConfig(
-    HashGridConfig,
-    CaptureConfig,
-    VectorConfig,
-    max_num_iterations=30_000,
-    num_rays_per_batch=2_048,
-    learning_rate=1e-2,
-    lr_schedule="hold-exponential",
-    lr_final=0.02,
-    adam_beta2=0.99,
-    adam_eps=1e-15,
-    eval_num_rays_per_chunk=4_096,
-    appearance_embedding_dim=48,
-    robust="off",
-):
+class NerfWConfig(CaptureConfig, VectorConfig, max_num_iterations=30_000, appearance_embedding_dim=48, robust="off"):
     """Settings of nerf-w; open ones depend on the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {

@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 from nerfloom import ConfigError, Decision, Method, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, Range
 from nerfloom.base.decisions import is_open
-from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import DensityField
@@ -42,17 +42,9 @@ SAMPLES_PER_BATCH = 2**14
 
 @dataclass(frozen=True)
 class ZipNeRFConfig(
-    HashGridConfig,
     CaptureConfig,
     DensityDirectionalConfig,
     max_num_iterations=25_000,
-    num_rays_per_batch=2_048,
-    learning_rate=1e-2,
-    lr_schedule="hold-exponential",
-    lr_final=0.02,
-    adam_beta2=0.99,
-    adam_eps=1e-15,
-    eval_num_rays_per_chunk=4_096,
     num_steps=256,
     num_levels=8,
     features_per_level=4,

@@ -30,7 +30,6 @@ from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.samplers.choice import decide_samples, make_sampler
-from nerfloom.samplers.proposal import ProposalSampler
 
 POWER_LADDER = -1.5
 """Exponent of the power ladder that spaces distances if space is contracted, the paper's for all scenes."""
@@ -109,8 +108,6 @@ def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
 def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
     """Return proposals with the anti-aliased loss for `scene`, or the sampler named by `config`."""
     scene = replace(scene, unbounded=config.contraction)
-    if config.sampler != "proposal":
-        return make_sampler(config, scene)
 
     def proposal(finest: int) -> DensityField:
         features = 1 if config.multisampled_proposals else 2
@@ -120,17 +117,8 @@ def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
         grid = MultisampledHashGrid(*sizes, config.sparse_updates, config.hash_decay_mult)
         return MultisampledDensity(scene.box, grid, unbounded=scene.unbounded)
 
-    made = ProposalSampler(
-        scene.box,
-        (*config.num_proposal_samples, config.num_nerf_samples),
-        unbounded=scene.unbounded,
-        endless=scene.unbounded and not scene.has_alpha,
-        fields=[proposal(finest) for finest in config.proposal_resolutions],
-        ladder=POWER_LADDER,
-        blurs=config.interlevel_blurs,
-    )
-    made.samples_per_step = config.samples_per_batch
-    return made
+    proposals = [proposal(finest) for finest in config.proposal_resolutions] if config.sampler == "proposal" else None
+    return make_sampler(config, scene, proposals=proposals, ladder=POWER_LADDER, blurs=config.interlevel_blurs)
 
 
 METHOD = Method(

@@ -17,11 +17,12 @@ from nerfloom.data.scene import Scene
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.base import Field
 from nerfloom.fields.encoded import DensityField
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.hierarchical import MIN_COARSE, HierarchicalSampler
 from nerfloom.samplers.motion import vertices_in_time
 from nerfloom.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
-from nerfloom.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
+from nerfloom.samplers.proposal import LEARN_EVERY, ProposalSampler
 
 NESTED_CELLS = 64
 """Cells along each axis of each nested box, a multiple of 4; 128 in Instant-NGP."""
@@ -200,6 +201,8 @@ def make_sampler(
     make_coarse: Callable[[], Field | None] | None = None,
     proposals: Sequence[Field] | None = None,
     learn_every: int = LEARN_EVERY,
+    ladder: float | None = None,
+    blurs: tuple[float, ...] = (),
 ) -> Sampler:
     """Return the sampler that the settings select.
 
@@ -209,6 +212,7 @@ def make_sampler(
         proposals: density fields of `--sampler proposal`. If None, they are hash grids, or planes in space and time for
             a method that learns motion.
         learn_every: number of steps from one update of the proposals to the next.
+        ladder, blurs: as in `ProposalSampler`.
 
     Raises:
         ConfigError: if the hierarchical sampler is selected and the method has no coarse level.
@@ -227,6 +231,8 @@ def make_sampler(
             endless=scene.unbounded and not scene.has_alpha,
             fields=proposals,
             learn_every=learn_every,
+            ladder=ladder,
+            blurs=blurs,
         )
     elif str(config.sampler) == "hierarchical":
         if make_coarse is None:

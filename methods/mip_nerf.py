@@ -20,7 +20,6 @@ from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_sampler, decide_samples, make_sampler
-from nerfloom.samplers.proposal import half_edge
 
 
 @dataclass(frozen=True)
@@ -59,14 +58,9 @@ def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Dec
 
 def make_field(config: MipNeRFConfig, scene: Scene) -> Field:
     """Return a network like NeRF's on the integrated encoding."""
-    encoding = IntegratedEncoding(
-        scene.box,
-        config.position_frequencies,
-        deviation=half_edge(scene.box) / scene.image_size,
-        contracted=contracted_box(config, scene) is not None,
-    )
+    contracted = contracted_box(config, scene) is not None
     field = IntegratedField(
-        encoding,
+        IntegratedEncoding.of_images(scene, config.position_frequencies, contracted),
         config.hidden_width,
         config.num_layers,
         skip=config.num_layers // 2 + 1,

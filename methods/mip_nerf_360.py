@@ -43,7 +43,7 @@ from nerfloom.samplers.choice import (
     make_sampler,
     samples_choices,
 )
-from nerfloom.samplers.proposal import LEARN_EVERY, half_edge
+from nerfloom.samplers.proposal import LEARN_EVERY
 
 DISTORTION = 0.01
 """Default weight of the distortion loss in unbounded scenes, the paper's."""
@@ -177,13 +177,8 @@ def make_proposals(config: MipNeRF360Config, scene: Scene) -> Sequence[Field]:
 
 
 def _encoding(config: MipNeRF360Config, scene: Scene) -> IntegratedEncoding:
-    return IntegratedEncoding(
-        scene.box,
-        config.position_frequencies,
-        deviation=half_edge(scene.box) / scene.image_size,
-        contracted=contracted_box(config, scene) is not None,
-        directions=icosahedron_directions(),
-    )
+    contracted = contracted_box(config, scene) is not None
+    return IntegratedEncoding.of_images(scene, config.position_frequencies, contracted, icosahedron_directions())
 
 
 def sampler(config: MipNeRF360Config, scene: Scene) -> Sampler:

@@ -24,6 +24,7 @@ from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.losses.functions import doubted_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import KNOWN_DISTANCES, Distortion, SamplerLoss
@@ -31,7 +32,6 @@ from nerfloom.methods._captures import CaptureConfig, RefinedModel, decide_captu
 from nerfloom.rendering.transient import STATIC, UNCERTAINTY, TransientRenderer
 from nerfloom.rendering.volume import scaled_up_to
 from nerfloom.samplers.choice import decide_samples, make_sampler
-from nerfloom.samplers.proposal import half_edge
 
 PAPER_WIDTH, GRID_WIDTH = 256, 64
 """Features per hidden layer: the paper's networks, with half as many in their heads, and networks on a hash grid."""

@@ -38,9 +38,9 @@ from nerfloom.data.pixels.batch import composite
 from nerfloom.data.source_views import images_of, nearest_in_direction, other_images
 from nerfloom.encodings.pixel_aligned import ImageEncoder, SourceViews
 from nerfloom.fields.pixel_aligned import PixelAlignedField
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.samplers.hierarchical import MIN_COARSE, HierarchicalSampler
-from nerfloom.samplers.proposal import half_edge
 
 BLOCKS_BEFORE, BLOCKS_AFTER = 3, 2
 """Residual blocks before and after the mean over views, as in the paper."""

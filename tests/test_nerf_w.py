@@ -10,12 +10,12 @@ from torch import Tensor
 from nerfloom import Field, Points, Rays, Sampler, Samples
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.losses.functions import doubted_error
 from nerfloom.losses.term import RenderedBatch
 from nerfloom.methods import nerf_w
 from nerfloom.methods.nerf_w import START
 from nerfloom.rendering.transient import TransientRenderer
-from nerfloom.samplers.proposal import half_edge
 from nerfloom.testing import assert_method
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.optim import make_optimizer

@@ -100,7 +100,6 @@ def refinement_choice(scene: Scene, marched: bool) -> Choice:
     """Return whether to refine poses.
 
     Args:
-        scene: properties of the data.
         marched: whether samples carry no gradient to rays.
     """
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
@@ -116,7 +115,6 @@ def decide_capture(
     """Decide the settings shared by methods for captures.
 
     Args:
-        config: the method's settings; open ones are filled in.
         proposals: intervals of each proposal without a time limit.
 
     Returns:
@@ -162,12 +160,9 @@ class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
             )
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the terms of `losses` on a batch.
+        """Return the terms of `losses` on a batch, from rays that refined poses move.
 
-        Args:
-            batch: pixels with their true colours, and rays from the poses of the data. Rays without cameras, such as a
-                teacher's, are not moved.
-            step: number of training steps done.
+        Rays without cameras, such as a teacher's, are not moved.
         """
         if self.poses is not None and batch.rays.camera_indices is not None:
             batch = replace(batch, rays=self.poses(batch.rays))

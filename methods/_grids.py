@@ -40,7 +40,6 @@ def finest_cells(scene: Scene, per_pixel: int = 1) -> Choice:
     """Return the cells along an axis at the finest level: the next power of two that gives each pixel enough.
 
     Args:
-        scene: properties of the whole scene.
         per_pixel: minimum number of cells per pixel of the images' longer side.
     """
     cells = 2 ** (per_pixel * scene.image_size - 1).bit_length()

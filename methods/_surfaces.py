@@ -190,7 +190,6 @@ def make_distance(config: SurfaceConfig, box: Tensor) -> Distance:
     """Return a distance that starts as a ball: a small network on a hash grid, or the papers' network.
 
     Args:
-        config: the method's settings, decided.
         box: (2, 3) corners of the box, scene units.
     """
     radius, width = config.start_radius, config.hidden_width
@@ -206,8 +205,6 @@ def surface_field(
 
     Args:
         kind: class of the field.
-        config: the method's settings, decided.
-        scene: properties of the whole scene.
         sharpness: class of the learnt inverse width.
     """
     box = foreground(config, scene).box
@@ -257,12 +254,7 @@ def make_sampler(config: SurfaceConfig, scene: Scene) -> Sampler:
 
 
 def make_background(config: SurfaceConfig, scene: Scene) -> Field:
-    """Return a field for the outside of the sphere.
-
-    Args:
-        config: the method's settings, decided.
-        scene: properties of the data; not used.
-    """
+    """Return a field for the outside of the sphere."""
     if config.encoding == "frequency":
         return NeRFField(config.hidden_width, dims=4)
     return InvertedField(HashGrid.of(config), config.hidden_width)
@@ -329,9 +321,6 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         """Find the imaged space, and let the first ball stand on a floor that a reconstruction's points show.
 
         A floor often has no texture. Nothing then pulls a surface to it, and the background would explain it.
-
-        Args:
-            dataset: the training images.
         """
         if self.hidden is not None and self.sphere is not None:
             least = max(self.config.rays_shared_by, 1)

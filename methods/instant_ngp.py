@@ -211,11 +211,7 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
 
 
 def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
-    """Return a field of the same size for the outside of the sphere.
-
-    Args:
-        scene: properties of the data; not used.
-    """
+    """Return a field of the same size for the outside of the sphere."""
     grid = HashGrid.of(config, config.open_levels_until)
     return InvertedField(grid, config.hidden_width, 4 if config.view_dependence else 0)
 

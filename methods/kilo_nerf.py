@@ -117,11 +117,7 @@ class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
             self.teacher = teacher
 
     def start(self, dataset: Dataset) -> None:
-        """Learn the teacher's field, if there is a teacher.
-
-        Args:
-            dataset: the training images.
-        """
+        """Learn the teacher's field, if there is a teacher."""
         if self.teacher is not None:
             box = self.scene.box.to(self.device)
             matter = MatterPoints(self.teacher, box, length_in(box)).around()

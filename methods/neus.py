@@ -56,4 +56,3 @@ METHOD = Method(
     model=NeuS,
     decide=decide_surface,
 )
-"""The method."""

@@ -79,13 +79,7 @@ class PixelNeRFConfig(
 
 
 class PixelNeRF(RayModel[PixelNeRFConfig]):
-    """A model of many scenes: the encoder takes images of a scene, and the field looks up their features.
-
-    Args:
-        field: the conditioned network.
-        sampler: chooses the positions along each ray.
-        renderer: turns samples into colours and depths.
-    """
+    """A model of many scenes: the encoder takes images of a scene, and `field` looks up their features."""
 
     field: PixelAlignedField
 
@@ -180,12 +174,7 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
     # -- learning and rendering -------------------------------------------------------------------------------
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the loss of pixels of a few images; each image is rendered from others of its scene.
-
-        Args:
-            batch: pixels with their true colours.
-            step: number of training steps done.
-        """
+        """Return the loss of pixels of a few images; each image is rendered from others of its scene."""
         assert batch.rays.camera_indices is not None
         images = batch.rays.camera_indices[:: batch.rays_per_pixel]
         num_samples: int | Tensor = 0

@@ -115,13 +115,7 @@ REGULARISERS = Sparsity("sparsity", "sparsity"), TotalVariation("total_variation
 
 
 class TensoRF(RayModel[TensoRFConfig], plain=True):
-    """A model with factors that grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
-
-    Args:
-        field: the `TensorField`.
-        sampler: chooses the samples along rays.
-        renderer: turns samples into colours and depths.
-    """
+    """A model with factors that grow from coarse to fine; an occupancy grid also shrinks their box around matter."""
 
     growths: Tensor
     """Number of growths so far."""

@@ -64,11 +64,7 @@ def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
 
 
 def make_background(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
-    """Return the network for the outside of the sphere, at points of the inverted sphere.
-
-    Args:
-        scene: properties of the data; not used.
-    """
+    """Return the network for the outside of the sphere, at points of the inverted sphere."""
     return _network(config, dims=4)
 
 

@@ -77,4 +77,3 @@ METHOD = Method(
     model=VolSDF,
     decide=decide_surface,
 )
-"""The method."""

@@ -102,11 +102,7 @@ class HasDensityNormals(Protocol):
     """A field that computes the normals of its density, and may predict normals that should equal them."""
 
     def density_normals(self, points: Points) -> Tensor:
-        """Return the outward unit normals (N, 3) of the density, with a gradient; 0 where its gradient is 0.
-
-        Args:
-            points: N points.
-        """
+        """Return the outward unit normals (N, 3) of the density, with a gradient; 0 where its own gradient is 0."""
 
 
 def predicted_normals(features: Tensor) -> Tensor:

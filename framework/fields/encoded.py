@@ -97,10 +97,8 @@ class DensityField(BoxField):
     """A field of density without colour, for proposals: mip-NeRF 360 (Barron et al. 2022), section 3.
 
     Args:
-        box: (2, 3) corners of the box, scene units.
-        encoding: encoding of positions in [0, 1]^3, or of positions and times in [0, 1]^4.
+        box, encoding, unbounded: as in `BoxField`.
         width: features of the hidden layer.
-        unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
     """
 
     def __init__(
@@ -125,14 +123,12 @@ class EncodedField(BoxField):
     """A field with a density network on an encoding, and a colour network on its output and the viewing direction.
 
     Args:
-        box: (2, 3) corners of the box, scene units.
-        encoding: encoding of positions in [0, 1]^3, or of positions and times in [0, 1]^4.
+        box, encoding, unbounded: as in `BoxField`.
         width: features of a hidden layer (64 in the paper).
         num_features: features that the density network passes to the colour network, the first being the log-density
             (16 in the paper).
         direction_levels: bands of the spherical harmonics of the viewing direction (4 in the paper); 0 for colours that
             do not depend on the direction.
-        unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
         appearance: the images' appearance vectors, an input of the colour network; None without.
         opening: bands of the viewing direction open one after the other (`OpenLevels`) during this fraction of the
             training budget; 0: all are open.

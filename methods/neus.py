@@ -35,10 +35,11 @@ class NeuSConfig(SurfaceConfig):
 class NeuS(SurfaceModel[NeuSConfig]):
     """A model with the opacity of NeuS, equation 13."""
 
+    field: NeuSField
+
     def before_step(self, step: int, progress: float) -> None:
         super().before_step(step, progress)
         until = self.config.anneal_slope_until
-        assert isinstance(self.field, NeuSField)
         self.field.sharpness.anneal(round(min(progress / until, 1.0) * 1024) / 1024 if until else 1.0)
 
 

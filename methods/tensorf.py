@@ -95,7 +95,7 @@ class Sparsity(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         model = shown.model
         assert isinstance(model, TensoRF)
-        factors, share = model.factors.density_factors, 0.5 if model.has_grown else 1.0
+        factors, share = model.field.density_factors, 0.5 if model.has_grown else 1.0
         bands = factors.bands(factors.all_factors)
         return share * torch.stack([band.abs().mean() for band in bands]).sum()
 
@@ -117,6 +117,7 @@ REGULARISERS = Sparsity("sparsity", "sparsity"), TotalVariation("total_variation
 class TensoRF(RayModel[TensoRFConfig], plain=True):
     """A model with factors that grow from coarse to fine; an occupancy grid also shrinks their box around matter."""
 
+    field: TensorField
     growths: Tensor
     """Number of growths so far."""
     losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, *REGULARISERS, *FEW_IMAGES)
@@ -131,12 +132,6 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
     def has_grown(self) -> bool:
         """True if the grid has grown at least once."""
         return self._growths.of(self.growths) > 0
-
-    @property
-    def factors(self) -> TensorField:
-        """The field with the factors to resample."""
-        assert isinstance(self.field, TensorField)
-        return self.field
 
     def before_step(self, step: int, progress: float) -> None:
         if step >= BLIND_STEPS or not isinstance(self.sampler, SkipsCells):
@@ -159,7 +154,7 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
     def _grow(self, share: float) -> None:
         """Resample the factors over the occupied box, with first^(1 - share) * last^share vertices."""
         voxels = self.config.first_voxels ** (1 - share) * self.config.last_voxels**share
-        box, field = self._occupied_box(), self.factors
+        box, field = self._occupied_box(), self.field
         vertices = cubic_vertices(voxels, box)
         if torch.equal(box, field.box) and vertices == field.density_factors.layout.resolutions[0]:
             return
@@ -174,8 +169,8 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
 
         With nested boxes the field contracts space and keeps its box.
         """
-        sampler, box = self.sampler, self.factors.box
-        if not isinstance(sampler, SkipsCells) or self.factors.unbounded:
+        sampler, box = self.sampler, self.field.box
+        if not isinstance(sampler, SkipsCells) or self.field.unbounded:
             return box.clone()
         cells = sampler.occupied.view((sampler.resolution,) * 3)
         around = box_around_cells(cells, sampler.box, MARGIN)

@@ -275,12 +275,12 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
     losses = (
         ColorError(),
         SamplerLoss(),
-        Silhouette("silhouette", "silhouette_loss_mult"),
-        Eikonal("eikonal", "eikonal_loss_mult"),
-        SurfacePoints("points", "points_loss_mult"),
-        DistanceBounds("bounds", "bounds_loss_mult"),
-        HiddenSpace("hidden", "hidden_loss_mult"),
-        Curvature("curvature", "curvature_loss_mult"),
+        Silhouette(),
+        Eikonal(),
+        SurfacePoints(),
+        DistanceBounds(),
+        HiddenSpace(),
+        Curvature(),
         *KNOWN_DISTANCES,
     )
 

@@ -36,8 +36,7 @@ from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.normals import NormalHead, density_normals, normal_penalties
 from nerfloom.kernels.compositing.density import ray_sum
 from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
-from nerfloom.losses.normals import PREDICTED_NORMALS
-from nerfloom.losses.term import LossTerm, RenderedBatch
+from nerfloom.losses.normals import PREDICTED_NORMALS, NormalPenalty
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import MARCHED_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.rendering.choice import volume_renderer
@@ -101,15 +100,11 @@ class NormalRenderer(VolumeRenderer):
         return replace(rendered, extras={**rendered.extras, **facing, **penalties})
 
 
-class IfPredicted(LossTerm):
-    """Mean over rays of a penalty on predicted normals (`normal_penalties`), "normals" or "orientation", if any."""
+class IfPredicted(NormalPenalty):
+    """A penalty on predicted normals, if there are any."""
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return model.config.predict_normals
-
-    def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        penalty: Tensor = shown.rendered.extras[f"{self.name}_penalty"]
-        return penalty.mean() if len(penalty) else None
 
 
 class Nerfacto(RefinedModel[NerfactoConfig], plain=True):

@@ -98,7 +98,7 @@ def test_the_term_is_the_mean_of_positive_distances_in_hidden_space() -> None:
     torch.manual_seed(0)
     trainer, field = exact_ball()
     model, (grid,) = trainer.model, parts(trainer.model, OccupancySampler)
-    batch, term = draw_batch(trainer.train_set, 16, "white"), HiddenSpace("hidden")
+    batch, term = draw_batch(trainer.train_set, 16, "white"), HiddenSpace()
     assert not term.applies(batch, model)  # in a scene without a background
     cells = model.hidden = HiddenCells(grid.box)
     assert term.applies(batch, model)

@@ -512,9 +512,9 @@ def test_the_curvature_term_is_that_of_level_sets() -> None:
     assert samples is not None
     radii = samples.positions(shown.batch.rays).norm(dim=-1)
     truth = (2 - 2 / (1 + (samples.deltas / radii).square()).sqrt()).sqrt()
-    found = Curvature("curvature")(shown)
+    found = Curvature()(shown)
     field.progress = 0.5
-    assert Curvature("curvature")(shown) is None  # details come last
+    assert Curvature()(shown) is None  # details come last
     assert found is not None
     nearest = min(abs(float(truth[first::BENT].mean()) / float(found) - 1) for first in range(BENT))
     assert nearest < 0.02
@@ -543,7 +543,7 @@ def test_the_eikonal_term_counts_samples_and_all_that_silhouettes_leave(monkeypa
         return shape(where)
 
     monkeypatch.setattr(field, "shape", recorded)
-    found = Eikonal("eikonal")(dataclasses.replace(shown, rendered=dataclasses.replace(shown.rendered, samples=longer)))
+    found = Eikonal()(dataclasses.replace(shown, rendered=dataclasses.replace(shown.rendered, samples=longer)))
     at_samples, elsewhere = len(samples) / EVERY, len(samples) // ANYWHERE
     assert elsewhere > 50
     assert [len(where) for where in asked] == [elsewhere]
@@ -579,7 +579,7 @@ def test_a_single_sample_has_a_curvature() -> None:
     )
     truth = (2 - 2 / (1 + (0.02 / 0.5) ** 2) ** 0.5) ** 0.5
     for _ in range(20):
-        assert float(Curvature("curvature")(shown)) == pytest.approx(truth, rel=0.01)  # type: ignore[arg-type]
+        assert float(Curvature()(shown)) == pytest.approx(truth, rel=0.01)  # type: ignore[arg-type]
 
 
 def test_silhouettes_are_weighted_as_the_pixels_are() -> None:
@@ -590,7 +590,7 @@ def test_silhouettes_are_weighted_as_the_pixels_are() -> None:
     shown = shown_by(trainer, dataclasses.replace(batch, weights=weights))
     wrong = (shown.pixels.accumulation - batch.alpha).tolist()
     truth = sum(weight * each**2 for weight, each in zip(weights.tolist(), wrong, strict=True)) / 64
-    assert float(Silhouette("silhouette")(shown)) == pytest.approx(truth, rel=1e-4)  # type: ignore[arg-type]
+    assert float(Silhouette()(shown)) == pytest.approx(truth, rel=1e-4)  # type: ignore[arg-type]
 
 
 def points_on_axes(radius: float) -> PixelBatch:
@@ -606,15 +606,15 @@ def test_points_of_a_reconstruction_pull_the_surface() -> None:
     trainer, field = exact_ball()
     with torch.no_grad():
         right = shown_by(trainer, points_on_axes(0.5))
-        assert float(SurfacePoints("points")(right)) < 1e-3  # type: ignore[arg-type]
-        assert float(DistanceBounds("bounds")(right)) < 1e-3  # type: ignore[arg-type]
+        assert float(SurfacePoints()(right)) < 1e-3  # type: ignore[arg-type]
+        assert float(DistanceBounds()(right)) < 1e-3  # type: ignore[arg-type]
         wrong = shown_by(trainer, points_on_axes(0.3))
-        assert float(SurfacePoints("points")(wrong)) == pytest.approx(0.2 / field.size, rel=0.01)  # type: ignore[arg-type]
-        assert float(DistanceBounds("bounds")(wrong)) > 0.05  # type: ignore[arg-type]
+        assert float(SurfacePoints()(wrong)) == pytest.approx(0.2 / field.size, rel=0.01)  # type: ignore[arg-type]
+        assert float(DistanceBounds()(wrong)) > 0.05  # type: ignore[arg-type]
         sure = dataclasses.replace(wrong.batch, deviations=torch.full((6,), 0.25))
-        assert float(SurfacePoints("points")(shown_by(trainer, sure))) == 0  # type: ignore[arg-type]
+        assert float(SurfacePoints()(shown_by(trainer, sure))) == 0  # type: ignore[arg-type]
         outside = shown_by(trainer, points_on_axes(-3.0))
-        assert SurfacePoints("points")(outside) is None
+        assert SurfacePoints()(outside) is None
 
 
 def test_a_distance_before_a_point_has_bounds() -> None:

@@ -26,6 +26,14 @@ SHARE = 1 / 16
 """`PredictedNormals` uses at most this fraction of the samples, on average."""
 
 
+class NormalPenalty(LossTerm):
+    """Mean over rays of a penalty of `normal_penalties`, "normals" or "orientation", from the renderer's extras."""
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        penalty: Tensor = shown.rendered.extras[f"{self.name}_penalty"]
+        return penalty.mean() if len(penalty) else None
+
+
 class PredictedNormals(LossTerm):
     """Penalties on the predicted normals of reflected directions, in methods with `PredictedNormalsConfig`.
 
@@ -33,6 +41,9 @@ class PredictedNormals(LossTerm):
     visible normals that face away from the camera. Each is a mean over rays of sums over samples. The sums are
     estimated without bias from samples that are drawn at random by their weights.
     """
+
+    def __init__(self) -> None:
+        super().__init__("normals")
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         config = model.config
@@ -51,7 +62,7 @@ class PredictedNormals(LossTerm):
         return "normals are compared at random samples" if config.directional == "reflected" else None
 
 
-PREDICTED_NORMALS = PredictedNormals("normals")
+PREDICTED_NORMALS = PredictedNormals()
 
 
 def penalties(rendered: Rendered, rays: Rays, field: Field) -> dict[str, Tensor]:

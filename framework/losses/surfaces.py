@@ -44,6 +44,9 @@ class Eikonal(LossTerm):
     It is computed at some of the samples and at random positions in the box.
     """
 
+    def __init__(self) -> None:
+        super().__init__("eikonal", "eikonal_loss_mult")
+
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
         if samples is None or samples.features is None or not len(samples):
@@ -80,6 +83,9 @@ def random_positions(count: int, field: SurfaceField, model: RayModel[Any]) -> T
 class Silhouette(LossTerm):
     """Difference between the opacity of pixels and the alpha of their images: the mask of IDR (Yariv et al. 2020)."""
 
+    def __init__(self) -> None:
+        super().__init__("silhouette", "silhouette_loss_mult")
+
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return batch.alpha is not None
 
@@ -96,6 +102,9 @@ class Curvature(LossTerm):
     term is the mean difference of the two unit normals, so that edges count less than noise everywhere. It applies
     during the first part `SMOOTH_UNTIL` of the training budget.
     """
+
+    def __init__(self) -> None:
+        super().__init__("curvature", "curvature_loss_mult")
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         samples, field = shown.rendered.samples, shown.model.field
@@ -153,6 +162,9 @@ class HiddenSpace(LossTerm):
     mean of max(f, 0) over random positions in the box, in halves of its shortest edge. It is 0 outside of hidden and
     occupied cells.
     """
+
+    def __init__(self) -> None:
+        super().__init__("hidden", "hidden_loss_mult")
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return bool(parts(model, HiddenCells))
@@ -222,6 +234,9 @@ class SurfacePoints(PointsTerm):
     The error is the excess of |f| over the point's standard deviation.
     """
 
+    def __init__(self) -> None:
+        super().__init__("points", "points_loss_mult")
+
     def errors(self, field: SurfaceField, known: KnownPoints) -> Tensor:
         found = field.shape(known.places(known.distances)).distances
         return torch.relu(found.abs() - known.deviations)
@@ -234,6 +249,9 @@ class DistanceBounds(PointsTerm):
     the distance to the point. Space just behind the point counts as solid: the signed distance there is negative, and
     its magnitude is at most the distance to the point. The error is the excess over these bounds.
     """
+
+    def __init__(self) -> None:
+        super().__init__("bounds", "bounds_loss_mult")
 
     def errors(self, field: SurfaceField, known: KnownPoints) -> Tensor:
         before = (known.distances - known.entries) * torch.rand_like(known.distances)

@@ -137,6 +137,9 @@ class DepthError(LossTerm):
 class FreeSpace(LossTerm):
     """Matter in space that other images see through (`--free-space`)."""
 
+    def __init__(self) -> None:
+        super().__init__("free_space", "free_space_loss_mult")
+
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return batch.clear is not None
 
@@ -149,12 +152,15 @@ class FreeSpace(LossTerm):
         return matter_before(rendered.weights, rendered.samples, clear)
 
 
-KNOWN_DISTANCES = DepthError(), DepthError(coarse=True), FreeSpace("free_space", "free_space_loss_mult")
+KNOWN_DISTANCES = DepthError(), DepthError(coarse=True), FreeSpace()
 """Terms of methods that learn from known distances."""
 
 
 class MatterNearCameras(LossTerm):
     """Optical depth right before cameras: FreeNeRF (Yang et al. 2023), equation 6."""
+
+    def __init__(self) -> None:
+        super().__init__("occlusion", "occlusion_loss_mult")
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         near = shown.model.config.occlusion_range * shown.model.scene.near
@@ -163,5 +169,5 @@ class MatterNearCameras(LossTerm):
         return torch.stack(before).sum() if before else None
 
 
-FEW_IMAGES = (MatterNearCameras("occlusion", "occlusion_loss_mult"),)
+FEW_IMAGES = (MatterNearCameras(),)
 """Terms of methods with settings that include `FewImagesConfig`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.encodings.hash_grid import HashGrid
@@ -86,7 +86,7 @@ class BoxField(Field):
             return None
         if grid.deferred is not None:
             grid.deferred.layout = grid.layout
-        weights = _weights(network)
+        weights, _ = network.parameters_by_layer()
         if weights[0].shape[1] != grid.num_features:  # the network has further inputs
             return None
         around = self.box if self.unbounded else None
@@ -187,7 +187,7 @@ class EncodedField(BoxField):
             return None
         if opening is not None and not opening.complete:
             return None
-        weights = _weights(head)
+        weights, _ = head.parameters_by_layer()
         fits = (weights[0].shape[1], weights[-1].shape[0]) == (self.num_features + self.direction_levels**2, 3)
         if head.bias or head.activation != "sigmoid" or not fits:
             return None
@@ -228,8 +228,3 @@ class EncodedField(BoxField):
             return spherical_harmonics(directions, levels)
         open_bands = spherical_harmonics(directions, opening.count)
         return opening.completed(open_bands, levels**2, 2 * opening.count - 1)
-
-
-def _weights(network: MLP) -> list[Tensor]:
-    """Return the weights of each layer."""
-    return [layer.weight for layer in network if isinstance(layer, nn.Linear)]

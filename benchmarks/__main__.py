@@ -26,7 +26,7 @@ from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError, shown
 from nerfloom.base.extras import install_command
 from nerfloom.cli.bench_results import run_benchmark, write_results
-from nerfloom.cli.common import check_weights, make_room, run_command
+from nerfloom.cli.common import check_weights, entry_point, make_room
 from nerfloom.training.run_path import data_name, trained_run
 
 USAGE = """\
@@ -50,12 +50,9 @@ to --output-dir or --output; poses and city print them.
 """
 
 
-def main() -> None:
-    """Run a benchmark on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run a benchmark on the `arguments` of the process."""
     run_benchmark("python -m benchmarks", arguments, KINDS, USAGE)
 
 

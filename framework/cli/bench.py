@@ -13,7 +13,7 @@ from nerfloom.base.errors import ConfigError, FlagError, nearest
 from nerfloom.cli.bench_flags import FramesFlags, KernelFlags, MethodFlags, ProfileFlags
 from nerfloom.cli.bench_gpu import GpuFlags, measure_gpu
 from nerfloom.cli.bench_results import run_benchmark, write_results
-from nerfloom.cli.common import make_room, run_command
+from nerfloom.cli.common import entry_point, make_room
 from nerfloom.training.run_path import data_name
 
 USAGE = """\
@@ -30,12 +30,9 @@ ns-bench WHAT --help shows its flags. Results are written as JSON to docs/result
 """
 
 
-def main() -> None:
-    """Run ns-bench on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-bench on the `arguments` of the process."""
     run_benchmark("ns-bench", arguments, KINDS, USAGE)
 
 

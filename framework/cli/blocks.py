@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.cli.common import run_command
+from nerfloom.cli.common import entry_point
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.job_flags import JobFlags
 from nerfloom.training.run_path import check_data, check_writable, data_name
@@ -78,12 +78,9 @@ class BlocksFlags(JobFlags):
         return flags
 
 
-def main() -> None:
-    """Run ns-blocks on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-blocks on the `arguments` of the process."""
     flags = read_flags(BlocksFlags, "ns-blocks", arguments)
     flags.check()
     if flags.data is not None:

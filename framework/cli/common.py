@@ -7,6 +7,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Collection, Mapping
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -182,6 +183,11 @@ def check_weights(path: Path | None) -> None:
         from nerfloom.evaluation.lpips import read_weights
 
         read_weights(path)
+
+
+def entry_point(command: Callable[[list[str]], None]) -> Callable[[], None]:
+    """Return the entry point of a `command`, a function of its arguments, as `run_command` runs it."""
+    return wraps(command)(lambda: run_command(command))
 
 
 def run_command(command: Callable[[list[str]], None]) -> None:

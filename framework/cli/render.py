@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfloom.base.from_nerfstudio import RENDERING
-from nerfloom.cli.common import chosen_kind, make_room, refuse_foreign, run_command, with_format, with_run
+from nerfloom.cli.common import chosen_kind, entry_point, make_room, refuse_foreign, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.render_flags import FLAGS, USAGE
 from nerfloom.cli.run_flags import OPENS
@@ -16,12 +16,9 @@ if TYPE_CHECKING:
     from nerfloom.training.file_data import DataFormat
 
 
-def main() -> None:
-    """Run ns-render on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-render on the `arguments` of the process."""
     if (chosen := chosen_kind(arguments, FLAGS, USAGE, "unknown path")) is None:
         return
     import tyro

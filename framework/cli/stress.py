@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
 from nerfloom.base.json_files import write_json
-from nerfloom.cli.common import make_room, run_command
+from nerfloom.cli.common import entry_point, make_room
 from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
 from nerfloom.training.run_path import check_data
@@ -60,12 +60,9 @@ class StressFlags:
     """JSON file to write, with a .md beside it. Default: outputs/stress-DATA/METHOD.json, or methods.json."""
 
 
-def main() -> None:
-    """Run ns-stress on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-stress on the `arguments` of the process."""
     if not arguments or arguments[0] in HELP:
         print(USAGE)
         return

@@ -25,10 +25,8 @@ if TYPE_CHECKING:
 K = TypeVar("K")
 
 
-def chosen_kind(
-    arguments: list[str], kinds: Mapping[str, K], usage: str, unknown: str
-) -> tuple[str, K, list[str]] | None:
-    """Look up the first argument, or print the help if it asks for help.
+def chosen_kind(arguments: list[str], kinds: Mapping[str, K], usage: str, unknown: str) -> tuple[str, K, list[str]]:
+    """Look up the first argument, or print the help if there is none or it asks for help.
 
     Args:
         arguments: arguments of the command.
@@ -37,14 +35,15 @@ def chosen_kind(
         unknown: start of the message for an unknown name, such as "unknown path".
 
     Returns:
-        The name, its entry of `kinds` and the remaining arguments; None if the help was printed.
+        The name, its entry of `kinds` and the remaining arguments.
 
     Raises:
         ConfigError: if `kinds` has no such name; the message suggests the nearest.
+        SystemExit: with status 0 after the help.
     """
     if not arguments or arguments[0] in HELP:
         print(usage)
-        return None
+        sys.exit(0)
     name = arguments[0]
     if name in KINDS and name not in kinds:
         raise ConfigError(f"'{name}' is nerfstudio's; {KINDS[name]}")

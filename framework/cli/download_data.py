@@ -40,9 +40,7 @@ class DownloadFlags:
 @entry_point
 def main(arguments: list[str]) -> None:
     """Run ns-download-data on the `arguments` of the process."""
-    if (chosen := chosen_kind(arguments, DATASETS, _usage(), "unknown data set")) is None:
-        return
-    name, dataset, rest = chosen
+    name, dataset, rest = chosen_kind(arguments, DATASETS, _usage(), "unknown data set")
     if any(word.partition("=")[0].replace("_", "-") == "--capture-name" for word in rest):
         raise FlagError("--capture-name is nerfstudio's; here it is --scenes")
     description = f"{dataset.title}\nscenes: {', '.join(dataset.scenes)}\nlicence: {dataset.licence}"

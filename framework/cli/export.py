@@ -47,9 +47,7 @@ has set. In .glb files, y is up.
 @entry_point
 def main(arguments: list[str]) -> None:
     """Run ns-export on the `arguments` of the process."""
-    if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
-        return
-    name, (kind, file), rest = chosen
+    name, (kind, file), rest = chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")
     refuse_foreign(rest, EXPORTING, "ns-export")
     words, named = with_format(f"ns-export {name}", with_run(rest))
     flags = read_flags(kind, f"ns-export {name}", words, takes=OPENS)

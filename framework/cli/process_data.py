@@ -33,9 +33,7 @@ ns-process-data KIND --help shows its flags.
 @entry_point
 def main(arguments: list[str]) -> None:
     """Run ns-process-data on the `arguments` of the process."""
-    if (chosen := chosen_kind(arguments, KINDS, USAGE, "unknown kind")) is None:
-        return
-    name, (kind, _), rest = chosen
+    name, (kind, _), rest = chosen_kind(arguments, KINDS, USAGE, "unknown kind")
     words = _spelt_out(rest, kind)
     if (other := _what_it_is(name, words)) is not None:
         name, words = other

@@ -19,11 +19,9 @@ if TYPE_CHECKING:
 @entry_point
 def main(arguments: list[str]) -> None:
     """Run ns-render on the `arguments` of the process."""
-    if (chosen := chosen_kind(arguments, FLAGS, USAGE, "unknown path")) is None:
-        return
     import tyro
 
-    name, path, rest = chosen
+    name, path, rest = chosen_kind(arguments, FLAGS, USAGE, "unknown path")
     refuse_foreign(rest, RENDERING, "ns-render")
     words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names"}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)

@@ -18,7 +18,7 @@ from tests.conftest import Refused
 @pytest.mark.parametrize("module", [bench, ours], ids=["ns-bench", "benchmarks"])
 def test_help_lists_every_benchmark_in_a_line_without_torch(module: ModuleType) -> None:
     shown = f"from {module.__name__} import main; sys.argv[1:] = ['--help']; main()"
-    code = f"import sys; {shown}; print('torch' in sys.modules)"
+    code = f"import atexit, sys; atexit.register(lambda: print('torch' in sys.modules)); {shown}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     *lines, torch_is_loaded = done.stdout.splitlines()
     assert torch_is_loaded == "False"

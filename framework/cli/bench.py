@@ -78,13 +78,12 @@ def _profile(flags: ProfileFlags) -> None:
     from nerfloom.benchmarks.profile_step import measure
     from nerfloom.benchmarks.results import add_row
     from nerfloom.cli.train import run_of
-    from nerfloom.comparison.plan import split_words
+    from nerfloom.comparison.plan import split_method
 
-    if not (words := split_words(flags.method, "--method")):
-        raise FlagError("--method is empty; give the name of a method, such as instant-ngp")
+    method, own = split_method(flags.method, "--method")
     path = flags.output_dir / "profile-step.json"
     make_room(path)
-    run = run_of(words[0], [*words[1:], "--data", str(flags.data)])
+    run = run_of(method, [*own, "--data", str(flags.data)])
     add_row(path, flags.method, measure(run, flags.steps, flags.max_seconds))
 
 

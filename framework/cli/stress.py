@@ -126,13 +126,11 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
 def _run(method: str, flags: StressFlags) -> Run:
     """Return the run that `ns-train` would start with the method and its flags."""
     from nerfloom.cli.train import run_of
-    from nerfloom.comparison.plan import split_words
+    from nerfloom.comparison.plan import split_method, split_words
 
-    words, data_flags = split_words(method, "METHOD"), split_words(flags.data_flags, "--data-flags")
-    if not words:
-        raise ConfigError("the method is missing, as in 'ns-stress instant-ngp'")
+    name, own = split_method(method, "METHOD")
     data = [] if flags.data is None else ["--data", str(flags.data)]
-    run = run_of(words[0], [*words[1:], *data, *data_flags])
+    run = run_of(name, [*own, *data, *split_words(flags.data_flags, "--data-flags")])
     if run.config.data != flags.data:
         raise ConfigError(f"{method}: put --data after the methods; all methods use the same photographs")
     return run

@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> None:
 def _quadrature(flags: QuadratureFlags) -> None:
     from benchmarks.quadrature import main as quadrature
 
-    flags.output_dir.mkdir(parents=True, exist_ok=True)
+    make_room(flags.output_dir / "quadrature.json")
     quadrature(flags.output_dir / "quadrature.json", flags.plot_dir, flags.quick, flags.seed)
 
 
@@ -88,14 +88,7 @@ def _curves(flags: CurvesFlags) -> None:
 
 
 def _tables(flags: TablesFlags) -> None:
-    """Run missing rows, or list or print existing ones.
-
-    Args:
-        flags: the flags of the command.
-
-    Raises:
-        ConfigError: if a table cannot be read, or a row failed.
-    """
+    """Run missing rows, or list or print existing ones."""
     from benchmarks.table_text import listing, markdown
     from benchmarks.tables import kept, read_table, run_rows
 
@@ -132,11 +125,6 @@ def _tables(flags: TablesFlags) -> None:
 
 
 def _processes(flags: ProcessesFlags) -> None:
-    """Measure, and write the results.
-
-    Args:
-        flags: the flags of the command.
-    """
     from benchmarks.processes import measure
 
     path = flags.output_dir / f"processes-{flags.data.resolve().name}.json"

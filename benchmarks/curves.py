@@ -177,7 +177,6 @@ def draw(plan: Plan, found: Sequence[Budget]) -> str:
     """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     FigureCanvasSVG(figure)
@@ -190,11 +189,7 @@ def draw(plan: Plan, found: Sequence[Budget]) -> str:
         psnrs = [row.mean("psnr") or 0.0 for row in rows]
         axes.plot(seconds, psnrs, dashes, color=color, marker="o", markersize=4, label=contender.label)
         axes.fill_between(seconds, list(map(min, seeds)), list(map(max, seeds)), color=color, alpha=0.2, linewidth=0)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.grid(True, which="both", linewidth=0.3, alpha=0.6)
-    axes.set(xlabel="training, s", ylabel="PSNR, dB")
+    plots.over_seconds(axes, "training, s")
+    axes.set_ylabel("PSNR, dB")
     axes.legend(fontsize="small", loc="best")
     return plots.as_svg(figure)

@@ -79,10 +79,7 @@ def conditions(data: str | None, flags: tuple[str, ...], seconds: float, views: 
 
 
 def run(plan: Plan) -> Budget:
-    """Train and evaluate the missing runs of a budget.
-
-    Args:
-        plan: the runs of the budget.
+    """Train and evaluate the missing runs of a `plan`, which are those of one budget.
 
     Returns:
         The measurements, with the reasons of failures.
@@ -101,12 +98,7 @@ def run(plan: Plan) -> Budget:
 
 
 def published(plan: Plan, found: Sequence[Budget]) -> dict[str, Any]:
-    """Return the results of all budgets as plain data, without paths of the machine.
-
-    Args:
-        plan: the runs of any budget.
-        found: measurements with each budget.
-    """
+    """Return the results `found` of all budgets as plain data, without the machine's paths; `plan` is of any budget."""
     runs = [run for budget in found for row in budget.rows for run in row.runs]
     machines: list[dict[str, Any]] = []
     for run in runs:
@@ -148,9 +140,7 @@ def _point(budget: Budget, row: Row) -> dict[str, Any]:
 def table(plan: Plan, found: Sequence[Budget]) -> Table:
     """Return PSNR by method and budget for a terminal, with the standard deviation of a run if there are several seeds.
 
-    Args:
-        plan: the runs of any budget.
-        found: measurements with each budget.
+    `plan` and `found` are as in `published`.
     """
     result = Table("PSNR, dB, after", *(f"{budget.seconds:g} s" for budget in found))
     for index, contender in enumerate(plan.contenders):
@@ -168,9 +158,7 @@ def _cell(row: Row) -> str:
 def draw(plan: Plan, found: Sequence[Budget]) -> str:
     """Plot PSNR against seconds of training: means over seeds, and a band from the worst seed to the best.
 
-    Args:
-        plan: the runs of any budget.
-        found: measurements with each budget.
+    `plan` and `found` are as in `published`.
 
     Returns:
         The plot as an SVG element.

@@ -11,12 +11,7 @@ from nerfloom.comparison import plots
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Draw the times of kernels, forward and backward together, ns on a logarithmic axis; report it if that fails.
-
-    Args:
-        rows: measurements with one number of threads.
-        path: file to write; its folder is created if missing.
-    """
+    """Draw the times of kernels in `rows`, ns on a logarithmic axis, to the file `path`, or report why not."""
     if not plots.available():
         say(plots.MISSING)
         return

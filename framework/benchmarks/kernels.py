@@ -79,11 +79,7 @@ class Row:
 
 
 def measure(samples: int, repeats: int) -> tuple[list[Row], dict[str, Any]]:
-    """Measure every kernel and print a table.
-
-    Args:
-        samples: number of samples in a batch.
-        repeats: number of runs for medians.
+    """Measure every kernel in `repeats` runs with batches of `samples`, and print a table of medians.
 
     Returns:
         The rows, and rows, machine and limits as plain data.

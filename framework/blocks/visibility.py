@@ -101,11 +101,7 @@ def points_in_view(view: View, placement: Placement, reach: float) -> tuple[Tens
 
 
 def write_visibility(file: Path, network: Visibility) -> None:
-    """Write a network to a file.
-
-    Args:
-        file: path of the file.
-        network: the network.
+    """Write a `network` to a `file`.
 
     Raises:
         OSError: if the file cannot be written.
@@ -116,10 +112,7 @@ def write_visibility(file: Path, network: Visibility) -> None:
 
 
 def read_visibility(file: Path) -> Visibility:
-    """Read a network from a file.
-
-    Args:
-        file: the file.
+    """Read a network from a `file`.
 
     Raises:
         DataError: if it cannot be read, or is damaged.

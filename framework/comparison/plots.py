@@ -6,6 +6,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
+from nerfloom.base.extras import install_command
 from nerfloom.comparison.measures import Row, pareto
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
@@ -16,11 +17,7 @@ MISSING = "without plots: pip install matplotlib"
 
 def available() -> bool:
     """Return whether matplotlib is installed."""
-    try:
-        import matplotlib as matplotlib
-    except ImportError:
-        return False
-    return True
+    return install_command("plots") is None
 
 
 def color_of(index: int) -> str:

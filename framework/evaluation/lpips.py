@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfloom.base.archives import uncompressed_size
-from nerfloom.base.errors import ConfigError
+from nerfloom.base.errors import ConfigError, one_line
 from nerfloom.base.extras import install_command
 
 NETWORK = "alex"
@@ -72,7 +72,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
     except zipfile.BadZipFile as error:
         raise ConfigError(f"{where} is not a .npz file of LPIPS's weights (docs/guides/evaluation.md)") from error
     except Exception as error:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, zlib.error and more
-        raise ConfigError(f"{where} is damaged: {str(error) or type(error).__name__}") from error
+        raise ConfigError(f"{where} is damaged: {one_line(error)}") from error
 
     def array(name: str, *shape: int) -> Tensor:
         found = arrays.get(name)

@@ -43,7 +43,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.checked import checked
-from nerfloom.base.errors import DataError
+from nerfloom.base.errors import DataError, one_line
 from nerfloom.kernels.splats.project import DEGREES
 from nerfloom.levels.nodes import Nodes
 from nerfloom.splats.gaussians import COLUMNS, Gaussians
@@ -214,8 +214,9 @@ def read_levels(file: Path) -> LevelsFile:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or error}") from error
     except (ValueError, LookupError, ArithmeticError, TypeError, RecursionError) as error:
-        because = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DataError(f"{file} is not a file of levels, or is damaged: {because}; copy or export it again") from error
+        raise DataError(
+            f"{file} is not a file of levels, or is damaged: {one_line(error)}; copy or export it again"
+        ) from error
 
 
 def _header(file: Path) -> tuple[dict[str, Any], int]:

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.base.extras import install_command
+from nerfloom.base.extras import require
 
 if TYPE_CHECKING:
     import viser
@@ -27,8 +27,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 def check_installed() -> None:
     """Raise ConfigError, with the install command, if viser is missing; call it before anything slow."""
-    if (command := install_command("viewer")) is not None:
-        raise ConfigError(f"the viewer needs viser: {command}")
+    require("viewer", "the viewer needs")
 
 
 def free_port(host: str, port: int) -> int:

@@ -31,11 +31,7 @@ MAX_CANDIDATES = 32
 
 
 def right_half(image: Tensor) -> Tensor:
-    """Return the right half (H, W - W // 2, ...) of an image, used for metrics.
-
-    Args:
-        image: (H, W, ...) image.
-    """
+    """Return the right half (H, W - W // 2, ...) of an `image` (H, W, ...), used for metrics."""
     return image[:, image.shape[1] // 2 :]
 
 

@@ -24,9 +24,9 @@ from benchmarks.flags import (
 )
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError, shown
-from nerfloom.base.extras import install_command
+from nerfloom.base.extras import require
 from nerfloom.cli.bench_results import run_benchmark, write_results
-from nerfloom.cli.common import check_weights, make_room, run_command
+from nerfloom.cli.common import check_weights, entry_point, make_room
 from nerfloom.training.run_path import data_name, trained_run
 
 USAGE = """\
@@ -50,19 +50,16 @@ to --output-dir or --output; poses and city print them.
 """
 
 
-def main() -> None:
-    """Run a benchmark on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run a benchmark on the `arguments` of the process."""
     run_benchmark("python -m benchmarks", arguments, KINDS, USAGE)
 
 
 def _quadrature(flags: QuadratureFlags) -> None:
     from benchmarks.quadrature import main as quadrature
 
-    flags.output_dir.mkdir(parents=True, exist_ok=True)
+    make_room(flags.output_dir / "quadrature.json")
     quadrature(flags.output_dir / "quadrature.json", flags.plot_dir, flags.quick, flags.seed)
 
 
@@ -91,14 +88,7 @@ def _curves(flags: CurvesFlags) -> None:
 
 
 def _tables(flags: TablesFlags) -> None:
-    """Run missing rows, or list or print existing ones.
-
-    Args:
-        flags: the flags of the command.
-
-    Raises:
-        ConfigError: if a table cannot be read, or a row failed.
-    """
+    """Run missing rows, or list or print existing ones."""
     from benchmarks.table_text import listing, markdown
     from benchmarks.tables import kept, read_table, run_rows
 
@@ -135,11 +125,6 @@ def _tables(flags: TablesFlags) -> None:
 
 
 def _processes(flags: ProcessesFlags) -> None:
-    """Measure, and write the results.
-
-    Args:
-        flags: the flags of the command.
-    """
     from benchmarks.processes import measure
 
     path = flags.output_dir / f"processes-{flags.data.resolve().name}.json"
@@ -188,8 +173,7 @@ def _pose_refinement(flags: PoseRefinementFlags) -> None:
 
 
 def _meshes(flags: MeshFlags) -> None:
-    if (advice := install_command("export")) is not None:
-        raise ConfigError(f"python -m benchmarks meshes needs packages that are not installed: {advice}")
+    require("export", "python -m benchmarks meshes needs")
     from benchmarks.meshes import measure
     from nerfloom.benchmarks.results import add_row
 

@@ -118,12 +118,7 @@ def trained_on(data: Path, folder: Path, seconds: float, limit: float | None) ->
 
 
 def train(trainer: Trainer, seconds: float) -> dict[str, Any]:
-    """Train and measure memory and speed.
-
-    Args:
-        trainer: trainer of a new run.
-        seconds: seconds of training.
-    """
+    """Train with the `trainer` of a new run for `seconds`, and measure memory and speed."""
     state, peaks, waited = trainer.state, {"RssAnon": 0.0, "RssFile": 0.0}, [0.0]
     PixelStream.look_up = timed_into(PixelStream.look_up, waited)  # type: ignore[method-assign]
     rays = since = wait = 0.0
@@ -145,11 +140,7 @@ def train(trainer: Trainer, seconds: float) -> dict[str, Any]:
 
 
 def status(*names: str) -> dict[str, float]:
-    """Return memory sizes of this process, MB; empty if the system does not report them.
-
-    Args:
-        names: names of lines of /proc/self/status.
-    """
+    """Return memory sizes of this process, MB, by `names` of lines of /proc/self/status; empty if it reports none."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
@@ -165,12 +156,7 @@ def forget_peak() -> None:
 
 
 def timed_into(function: Callable[..., Any], spent: list[float]) -> Callable[..., Any]:
-    """Return a function that adds the seconds of its calls to a sum.
-
-    Args:
-        function: function to call.
-        spent: a list with one element, the sum.
-    """
+    """Return a function that adds the seconds of its calls of `function` to the only element of `spent`."""
 
     def timed(*arguments: Any) -> Any:
         start = time.perf_counter()

@@ -10,20 +10,12 @@ from nerfloom.base.errors import NerfloomError
 
 
 def own_command(name: str, *arguments: object) -> list[str]:
-    """Return the command line that runs a module of this folder as a program, from the root of the repository.
-
-    Args:
-        name: name of the module.
-        arguments: command-line arguments, converted to strings.
-    """
+    """Return the command line that runs the module `name` of this folder with `arguments`, in the repository's root."""
     return [sys.executable, "-m", f"benchmarks.{name}", *map(str, arguments)]
 
 
 def output_of(command: Sequence[str]) -> str:
-    """Run a command to its end and return its standard output.
-
-    Args:
-        command: a program and its arguments, as from `python_command`.
+    """Run a `command`, as from `python_command`, to its end and return its standard output.
 
     Raises:
         NerfloomError: if it fails; the message has the last line of its standard error.

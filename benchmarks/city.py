@@ -140,13 +140,7 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def rows(c: City, k: Constants, m: Measured) -> list[Row]:
-    """Return the rows of the table.
-
-    Args:
-        c: the inputs.
-        k: constants of the package.
-        m: measured values.
-    """
+    """Return the rows of the table for the inputs `c`, the constants `k` of the package, and measured values `m`."""
     times = 1 / (1 - c.overlap) ** 2  # blocks in a plane overlap along two axes
     own, picture, digits = c.images / c.blocks * times, c.width * c.height, len(str(c.images - 1))
     small = _kept(c, max(c.width, c.height) // k.small)

@@ -65,11 +65,7 @@ class Shape(Protocol):
         """Return whether `positions` (N, 3) are inside, (N,) bool; the boundary is inside."""
 
     def crossing(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distances (R,) where rays enter and leave; equal for rays that miss.
-
-        Args:
-            origins, directions: (R, 3) rays.
-        """
+        """Return distances (R,) where rays, `origins` and `directions` (R, 3), enter and leave; equal if they miss."""
 
 
 @dataclass(frozen=True)
@@ -126,11 +122,7 @@ class Medium:
 
 
 class Solids(ClosedForm):
-    """Media of constant density, which may be nested: where several overlap, only the last one counts.
-
-    Args:
-        media: the media, outer ones before inner ones.
-    """
+    """Media of constant density, outer ones before inner ones: where several overlap, only the last one counts."""
 
     def __init__(self, *media: Medium) -> None:
         super().__init__()
@@ -198,13 +190,7 @@ class Gaussian:
         return self.peak * torch.exp(-squared / (2 * self.deviation**2))
 
     def optical_depth(self, origins: Tensor, directions: Tensor, starts: Tensor, t: Tensor) -> Tensor:
-        """Return the optical depth (R, B) of intervals of rays.
-
-        Args:
-            origins, directions: (R, 3) rays.
-            starts: (R,) start distances of the intervals.
-            t: (R, B) end distances of the intervals.
-        """
+        """Return the optical depth (R, B) of rays, `origins` and `directions` (R, 3), from `starts` (R,) to `t`."""
         nearest, squared = _nearest(origins, directions, self.center)
         width = self.deviation * math.sqrt(2) / directions.norm(dim=-1)
         whole = self.peak * torch.exp(-squared / (2 * self.deviation**2)) * width * math.sqrt(math.pi) / 2
@@ -213,11 +199,7 @@ class Gaussian:
 
 
 class Blobs(ClosedForm):
-    """Overlapping Gaussians with densities that add up; each emits its own colour.
-
-    Args:
-        gaussians: the Gaussians.
-    """
+    """Overlapping Gaussians with densities that add up; each emits its own colour."""
 
     def __init__(self, *gaussians: Gaussian) -> None:
         super().__init__()

@@ -60,11 +60,7 @@ class Row:
     """Environment variables of the trainings."""
 
     def fair_share(self, cores: int) -> float:
-        """Return the fair share of the cores for one training with a thread on each core.
-
-        Args:
-            cores: number of cores of the machine.
-        """
+        """Return the fair share of the machine's `cores` for one training with a thread on each core."""
         if self.own_group:
             return 0.5
         weight = 1.0 if self.nice == 0 else 15 / 1024  # the scheduler's weight for nice 19
@@ -119,10 +115,7 @@ def measure(data: Path, seconds: float, parts: Sequence[str] = (), works: Sequen
 
 
 def chosen(parts: Sequence[str]) -> list[Row]:
-    """Return the conditions with given names; `ALONE` is always included, because speeds are fractions of its speed.
-
-    Args:
-        parts: names or parts of names; all conditions if empty.
+    """Return the conditions with one of `parts` in their names, or all, and `ALONE`: speeds are fractions of its speed.
 
     Raises:
         ConfigError: if one is not part of any name.
@@ -171,14 +164,7 @@ def beside(row: Row, work: str, data: Path, seconds: float, cores: int) -> dict[
 
 
 def wait_for(process: subprocess.Popen[str], start: str) -> str:
-    """Read a process's output up to the next line with a given beginning.
-
-    Args:
-        process: process with a pipe for its output.
-        start: beginning of the line.
-
-    Returns:
-        The line.
+    """Read the output of a `process`, a pipe, up to the next line that begins with `start`, and return this line.
 
     Raises:
         NerfloomError: if the process ends before that.
@@ -190,12 +176,7 @@ def wait_for(process: subprocess.Popen[str], start: str) -> str:
 
 
 def child(work: str, data: Path, seconds: float) -> dict[str, float]:
-    """Wait for a line on standard input, then train or render and measure the speed.
-
-    Args:
-        work: training or rendering.
-        data: folder of the data set.
-        seconds: seconds of the measurement.
+    """Wait for a line on standard input, then do `work`, training or rendering, on `data` for `seconds`.
 
     Returns:
         Steps or images per second, and the seconds of the first, the longest and the median one.
@@ -222,12 +203,7 @@ def child(work: str, data: Path, seconds: float) -> dict[str, float]:
 
 
 def rendering(trainer: Trainer, views: Dataset) -> Callable[[int], object]:
-    """Train for a few steps, and return a function that renders a test view by its number.
-
-    Args:
-        trainer: trainer of a run.
-        views: its test images.
-    """
+    """Train for a few steps by `trainer`, and return a function that renders one of the test `views` by its number."""
     for _ in range(STEPS_BEFORE_RENDERING):
         trainer.train_step()
     background = trainer.model.background
@@ -235,12 +211,7 @@ def rendering(trainer: Trainer, views: Dataset) -> Callable[[int], object]:
 
 
 def timed(function: Callable[[int], object], number: int) -> float:
-    """Return the seconds of a call.
-
-    Args:
-        function: function to call.
-        number: its argument.
-    """
+    """Return the seconds of a call of `function` with `number`."""
     start = time.perf_counter()
     function(number)
     return time.perf_counter() - start

@@ -79,10 +79,7 @@ def conditions(data: str | None, flags: tuple[str, ...], seconds: float, views: 
 
 
 def run(plan: Plan) -> Budget:
-    """Train and evaluate the missing runs of a budget.
-
-    Args:
-        plan: the runs of the budget.
+    """Train and evaluate the missing runs of a `plan`, which are those of one budget.
 
     Returns:
         The measurements, with the reasons of failures.
@@ -101,12 +98,7 @@ def run(plan: Plan) -> Budget:
 
 
 def published(plan: Plan, found: Sequence[Budget]) -> dict[str, Any]:
-    """Return the results of all budgets as plain data, without paths of the machine.
-
-    Args:
-        plan: the runs of any budget.
-        found: measurements with each budget.
-    """
+    """Return the results `found` of all budgets as plain data, without the machine's paths; `plan` is of any budget."""
     runs = [run for budget in found for row in budget.rows for run in row.runs]
     machines: list[dict[str, Any]] = []
     for run in runs:
@@ -148,9 +140,7 @@ def _point(budget: Budget, row: Row) -> dict[str, Any]:
 def table(plan: Plan, found: Sequence[Budget]) -> Table:
     """Return PSNR by method and budget for a terminal, with the standard deviation of a run if there are several seeds.
 
-    Args:
-        plan: the runs of any budget.
-        found: measurements with each budget.
+    `plan` and `found` are as in `published`.
     """
     result = Table("PSNR, dB, after", *(f"{budget.seconds:g} s" for budget in found))
     for index, contender in enumerate(plan.contenders):
@@ -168,16 +158,13 @@ def _cell(row: Row) -> str:
 def draw(plan: Plan, found: Sequence[Budget]) -> str:
     """Plot PSNR against seconds of training: means over seeds, and a band from the worst seed to the best.
 
-    Args:
-        plan: the runs of any budget.
-        found: measurements with each budget.
+    `plan` and `found` are as in `published`.
 
     Returns:
         The plot as an SVG element.
     """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     FigureCanvasSVG(figure)
@@ -190,11 +177,7 @@ def draw(plan: Plan, found: Sequence[Budget]) -> str:
         psnrs = [row.mean("psnr") or 0.0 for row in rows]
         axes.plot(seconds, psnrs, dashes, color=color, marker="o", markersize=4, label=contender.label)
         axes.fill_between(seconds, list(map(min, seeds)), list(map(max, seeds)), color=color, alpha=0.2, linewidth=0)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.grid(True, which="both", linewidth=0.3, alpha=0.6)
-    axes.set(xlabel="training, s", ylabel="PSNR, dB")
+    plots.over_seconds(axes, "training, s")
+    axes.set_ylabel("PSNR, dB")
     axes.legend(fontsize="small", loc="best")
     return plots.as_svg(figure)

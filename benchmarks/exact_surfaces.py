@@ -16,15 +16,12 @@ CHUNK = 2**17
 
 
 def surface_sample(distance: SignedDistance, box: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return points (count, 3) float64 evenly distributed on a surface, and its outward normals.
+    """Return `count` evenly distributed points (count, 3) float64 of a surface, and its outward normals.
+
+    The surface is where `distance` is 0, in a `box` (2, 3).
 
     Points are drawn in a thin shell around the surface, and moved along the gradient of the distance. The distribution
     is even up to terms of the shell's thickness times the curvature.
-
-    Args:
-        distance: the surface.
-        box: (2, 3) a box that holds it.
-        count: number of points.
     """
     box, points, normals, found = box.double(), [], [], 0
     while found < count:

@@ -94,12 +94,7 @@ def planned_run(contender: Contender, seed: int, runs: Path) -> PlannedRun:
 
 
 def check_data(contender: Contender, conditions: Conditions, where: str) -> None:
-    """Check that `ns-eval` can be given the data of a contender.
-
-    Args:
-        contender: the contender.
-        conditions: its data.
-        where: place in the table, for the message.
+    """Check that `ns-eval` can be given the data of a `contender` under `conditions`; `where` is for the message.
 
     Raises:
         ConfigError: if the data's flags need the name of their format.

@@ -83,11 +83,7 @@ def measure(run: Path | None, seconds: float, kinds: Sequence[str], resolutions:
 
 
 class Truth:
-    """The known surface of a run's scene, in the frame of its input.
-
-    Args:
-        run: folder of the run.
-    """
+    """The known surface of the scene of a `run`, its folder, in the frame of its input."""
 
     def __init__(self, run: Path) -> None:
         loaded = read_run(run)

@@ -99,11 +99,7 @@ class Counted:
     """Number of waits by place: file and function."""
 
     def row(self, method: str) -> dict[str, Any]:
-        """Return the means over the steps as plain data.
-
-        Args:
-            method: name of the method.
-        """
+        """Return the means over the steps of a `method`, its name, as plain data."""
         places = {place: round(count / self.steps, 2) for place, count in self.waits.most_common(MAX_REPORTED)}
         return {
             "method": method,
@@ -154,13 +150,7 @@ def trainer_of(method: str, folder: Path, scene: Callable[[int], Dataset] | None
 
 
 def counted(trainer: Trainer, before: int, steps: int) -> Counted:
-    """Run training steps, and count operations and waits of the last ones.
-
-    Args:
-        trainer: the trainer of a run, on the CPU.
-        before: number of uncounted steps.
-        steps: number of counted steps.
-    """
+    """Run steps of a `trainer` on the CPU, and count operations and waits of the last `steps`, after `before`."""
     trainer.steps_per_read = STEPS_PER_LOG  # as on devices other than the CPU
     with patch.object(devices, "runs_ahead", lambda device: True):  # as on devices other than the CPU
         for _ in range(before):
@@ -208,11 +198,7 @@ class Counting(TorchDispatchMode):
 
 
 class _Transfers(TorchFunctionMode):
-    """Notices transfers between host and device, which do not reach the dispatcher on the CPU.
-
-    Args:
-        waits: number of waits by place; transfers are added.
-    """
+    """Notices transfers between host and device, which do not reach the CPU's dispatcher, and adds them to `waits`."""
 
     def __init__(self, waits: Counter[str]) -> None:
         super().__init__()

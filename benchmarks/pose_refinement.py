@@ -91,10 +91,7 @@ def disturb(cameras: Cameras, degrees: float, share: float) -> Cameras:
 
 
 def refinable(method: str) -> Any:
-    """Return the settings of a method that refines poses; with proposals if it needs them: marches have no gradient.
-
-    Args:
-        method: name of the method.
+    """Return the settings of a `method` that refines poses; with proposals if it needs them: marches have no gradient.
 
     Raises:
         ConfigError: if the method cannot refine poses.

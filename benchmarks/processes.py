@@ -56,15 +56,9 @@ def measure(
 def trained(
     data: Path, processes: int, seconds: float, seed: int, samples: int, targets: Sequence[float]
 ) -> dict[str, Any]:
-    """Train once, with torchrun for several processes, and return the learning curve and results from it.
+    """Train once in some `processes`, by torchrun if several, with a `seed`, and return the learning curve and results.
 
-    Args:
-        data: folder of the data set.
-        processes: number of processes.
-        seconds: seconds of training.
-        seed: random seed.
-        samples: samples per training step of each process.
-        targets: PSNRs, dB.
+    `data`, `seconds`, `samples` and `targets` are as in `measure`.
     """
     flags = ("instant-ngp", "--data", data, "--max-seconds", seconds)
     command = python_command("nerfloom.cli.train", *flags)

@@ -8,7 +8,6 @@ cells and ending rays early change colours. Ending rays has an error bound, and 
 from __future__ import annotations
 
 import functools
-import json
 import math
 import time
 from collections.abc import Callable, Iterable
@@ -35,6 +34,8 @@ from benchmarks.sampling import (
 )
 from nerfloom.base.console import console, say
 from nerfloom.base.device import seed_step, stream_seed
+from nerfloom.base.json_files import finite_or_null
+from nerfloom.cli.bench_results import write_results
 from nerfloom.geometry.rays import Rays
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.samplers.proposal import ProposalSampler
@@ -146,9 +147,7 @@ def main(output: Path, plots: Path | None = None, quick: bool = False, seed: int
         "evaluations needed": needed,
         "skipping": [asdict(skip) for skip in skips],
     }
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(content, indent=2) + "\n")
-    say(f"written to {output}")
+    write_results(output, finite_or_null(content))
     if plots is not None:
         for path in draw(curves(rows), plots):
             say(f"drawn: {path}")

@@ -41,12 +41,7 @@ FIT_RAYS = 1024
 
 
 def random_rays(count: int, seed: int) -> Rays:
-    """Return random rays from all sides to positions uniform in the largest ball in the scene's box.
-
-    Args:
-        count: number of rays.
-        seed: random seed.
-    """
+    """Return `count` random rays by `seed`, from all sides to positions uniform in the largest ball in the box."""
     generator = torch.Generator().manual_seed(seed)
     origins, outwards = (normalize(torch.randn(count, 3, generator=generator), dim=-1) for _ in range(2))
     origins, targets = DISTANCE * origins, outwards * torch.rand(count, 1, generator=generator) ** (1 / 3)
@@ -88,37 +83,20 @@ class Counted(Field):
 
 
 def render(field: Field, sampler: Sampler, rays: Rays, jitter: bool) -> Rendered:
-    """Render a field with a sampler, over white.
-
-    Args:
-        field: density and colour.
-        sampler: chooses the samples.
-        rays: R rays.
-        jitter: whether sample positions are random.
-    """
+    """Render a `field` over white along R `rays`, with samples of a `sampler`, at random positions if `jitter`."""
     return VolumeRenderer().render(rays, sampler.sample(rays, field, jitter), field, WHITE)
 
 
 def sampled(scene: Field, sampler: Sampler, jitter: bool, rays: Rays) -> Picture:
-    """Render a scene with a sampler that evaluates only the field.
-
-    Args:
-        scene: the scene.
-        sampler: chooses the samples.
-        jitter: whether sample positions are random.
-        rays: R rays.
-    """
+    """Render a `scene` with a `sampler` that evaluates only the field; `jitter` and `rays` are as in `render`."""
     field = Counted(scene)
     return Picture(render(field, sampler, rays, jitter).rgb, field.count, 0)
 
 
 def hierarchical(scene: Field, counts: tuple[int, int], rays: Rays) -> Picture:
-    """Render a scene with hierarchical sampling, using the field also as the coarse field.
+    """Render a `scene` along `rays` with hierarchical sampling, using the field also as the coarse field.
 
-    Args:
-        scene: the scene.
-        counts: samples per ray of the coarse field, and further samples of the fine field.
-        rays: R rays.
+    `counts` are samples per ray of the coarse field, and further samples of the fine field.
     """
     coarse, fine = Counted(scene), Counted(scene)
     sampler = HierarchicalSampler(coarse, *counts)
@@ -126,27 +104,16 @@ def hierarchical(scene: Field, counts: tuple[int, int], rays: Rays) -> Picture:
 
 
 def proposed(scene: Field, sampler: ProposalSampler, counts: tuple[int, ...], rays: Rays) -> Picture:
-    """Render a scene with proposals.
+    """Render a `scene` along `rays` with the proposals of a `sampler`, trained on the scene.
 
-    Args:
-        scene: the scene.
-        sampler: proposals trained on the scene.
-        counts: intervals per ray of each proposal and of the field, independent of the proposals' training.
-        rays: R rays.
+    `counts` are intervals per ray of each proposal and of the field, independent of the proposals' training.
     """
     sampler.counts = counts
     return sampled(scene, sampler, False, rays)._replace(coarse_evaluations=sum(counts[:-1]) * len(rays))
 
 
 def marched(scene: Field, sampler: OccupancySampler, early_stop: float, rays: Rays) -> Picture:
-    """Render a scene by marching through an occupancy grid.
-
-    Args:
-        scene: the scene.
-        sampler: the filled grid.
-        early_stop: transmittance where rays end.
-        rays: R rays.
-    """
+    """Render a `scene` by marching `rays` through the filled grid of a `sampler`, to the transmittance `early_stop`."""
     sampler.early_stop = early_stop
     return sampled(scene, sampler, False, rays)
 
@@ -184,13 +151,9 @@ def full_grid(num_steps: int) -> OccupancySampler:
 
 
 def filled_grid(scene: Field, resolution: int, seed: int, num_steps: int) -> OccupancySampler:
-    """Return a grid filled by its own updates.
+    """Return a grid for marches in `num_steps`, of `resolution` cells per axis, filled by its updates with a `scene`.
 
-    Args:
-        scene: the scene.
-        resolution: cells per axis.
-        seed: random seed.
-        num_steps: marching steps along the box's diagonal.
+    Updates are random, by `seed`.
     """
     sampler = OccupancySampler(BOX, resolution, num_steps)
     for step in range(GRID_STEPS + 1):
@@ -200,12 +163,7 @@ def filled_grid(scene: Field, resolution: int, seed: int, num_steps: int) -> Occ
 
 
 def fitted_proposals(scene: Field, steps: int, seed: int) -> tuple[ProposalSampler, float]:
-    """Train proposals on a scene with their own loss.
-
-    Args:
-        scene: the scene.
-        steps: number of training steps.
-        seed: random seed.
+    """Train proposals on a `scene` with their own loss for some `steps`, with a random `seed`.
 
     Returns:
         The proposals, and the seconds of training.

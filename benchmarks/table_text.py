@@ -19,11 +19,7 @@ Column = tuple[str, Callable[[Result], float | None], Callable[[float], str]]
 
 
 def columns(table: Table, found: Sequence[Result]) -> list[Column]:
-    """Return the columns of a table that some result has a value for.
-
-    Args:
-        found: all results.
-    """
+    """Return the columns of a `table` that some result of all, `found`, has a value for."""
     sizes = sorted({size for result in found for size in result["results"].get("by_size", {})}, key=len)
     every = all_columns(sizes, table.images)
     return [column for column in every if any(column[1](result) is not None for result in found)]
@@ -123,12 +119,7 @@ def cell(column: Column, found: Sequence[Result]) -> str:
 
 
 def listing(rows: Sequence[Row], results: Path) -> str:
-    """Return a line for each row with its name and its PSNR or estimated time, and the total time.
-
-    Args:
-        rows: the rows.
-        results: the file of their table's results.
-    """
+    """Return a line for each of `rows` with its PSNR in the file `results` or its estimated time, and their total."""
     found = [(row, kept(row, results)) for row in rows]
     done = [(row, result) for row, result in found if result is not None]
     missing = {row.name: estimate(row, done) for row, result in found if result is None}
@@ -144,10 +135,9 @@ def listing(rows: Sequence[Row], results: Path) -> str:
 
 
 def estimate(row: Row, done: Sequence[tuple[Row, Result]]) -> float:
-    """Return the estimated seconds of a row: loading, training and evaluation, as in finished rows.
+    """Return the estimated seconds of a `row`: loading, training and evaluation, as in finished rows, `done`.
 
-    Args:
-        done: finished rows. Results with the same method and data are used, otherwise any with the same data.
+    Results with the same method and data are used, otherwise any with the same data.
     """
     near = [(other, found) for other, found in done if other.data == row.data]
     same = [(other, found) for other, found in near if other.method == row.method] or near

@@ -211,10 +211,7 @@ def _conditions(place: str, root: Path, seconds: float, views: int | None) -> Co
 
 
 def kept(row: Row, file: Path) -> Result | None:
-    """Return the result of a row, or None if it is not there.
-
-    Args:
-        file: the table's results.
+    """Return the result of a `row` in the `file` of its table, or None if it is not there.
 
     Raises:
         ConfigError: if the result is of another command.
@@ -276,11 +273,7 @@ def _job(row: Row) -> Job:
 
 
 def result_of(row: Row, root: Path) -> Result:
-    """Return the result of a finished row, without paths of the machine.
-
-    Args:
-        root: folder of the folders of all data.
-    """
+    """Return the result of a finished `row`, without paths of the machine: names of files begin below `root`."""
     planned = row.planned
     evaluation, summary = read_json(planned.evaluation), read_json(planned.folder / SUMMARY)
     words = planned.user_command(row.conditions)

@@ -44,7 +44,6 @@ class OctreeConfig(
     """Settings of learning an octree's leaves."""
 
     RANGES: ClassVar[dict[str, Range]] = {"degree": (0, MAX_DEGREE)}
-    """Allowed ranges."""
     degree: int = 1
     """Degree of the harmonics of colours, 0 to 3."""
 

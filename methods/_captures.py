@@ -22,6 +22,7 @@ from nerfloom.base.config import AT_LEAST_0, AUTO, Auto, Range, RayConfig
 from nerfloom.base.decisions import Choice, fill, is_open
 from nerfloom.base.optimised import Optimised
 from nerfloom.cameras.refinement import POSE_REASONS, PoseRefinement
+from nerfloom.encodings.hash_grid import HashGridConfig
 from nerfloom.samplers.choice import PROPOSAL_SAMPLES, SamplingConfig, decide_samples, sampler_choice, samples_choices
 
 DISTORTION = 2e-3
@@ -43,7 +44,6 @@ class RefinedConfig(RayConfig):
     """Settings of a method that may refine the poses of its training cameras."""
 
     RANGES: ClassVar[dict[str, Range]] = {"camera_learning_rate": AT_LEAST_0}
-    """Allowed range of each numeric setting."""
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
     """Refinement of the training cameras' poses. auto: SO3xR3 if a device tracked them, otherwise off. A method that
     learns a density needs --sampler proposal for it; with an occupancy grid, auto is off."""
@@ -57,11 +57,20 @@ class ProposedConfig(RefinedConfig, SamplingConfig, num_proposal_samples=AUTO, n
 
 
 @dataclass(frozen=True)
-class CaptureConfig(ProposedConfig):
-    """Settings of a method for captures."""
+class CaptureConfig(
+    HashGridConfig,
+    ProposedConfig,
+    num_rays_per_batch=2_048,
+    learning_rate=1e-2,
+    lr_schedule="hold-exponential",
+    lr_final=0.02,
+    adam_beta2=0.99,
+    adam_eps=1e-15,
+    eval_num_rays_per_chunk=4_096,
+):
+    """Settings of a method for captures on a hash grid."""
 
     RANGES: ClassVar[dict[str, Range]] = {"distortion_loss_mult": AT_LEAST_0}
-    """Allowed range of each numeric setting."""
     contraction: Auto[bool] = AUTO
     """Whether to contract space outside the box. auto: in unbounded scenes."""
     distortion_loss_mult: Auto[float] = AUTO
@@ -91,7 +100,6 @@ def refinement_choice(scene: Scene, marched: bool) -> Choice:
     """Return whether to refine poses.
 
     Args:
-        scene: properties of the data.
         marched: whether samples carry no gradient to rays.
     """
     refined = "SO3xR3" if scene.poses == "device" and not scene.warped else "off"
@@ -107,7 +115,6 @@ def decide_capture(
     """Decide the settings shared by methods for captures.
 
     Args:
-        config: the method's settings; open ones are filled in.
         proposals: intervals of each proposal without a time limit.
 
     Returns:
@@ -153,12 +160,9 @@ class RefinedModel(RayModel[RefinedConfigT], Generic[RefinedConfigT]):
             )
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the terms of `losses` on a batch.
+        """Return the terms of `losses` on a batch, from rays that refined poses move.
 
-        Args:
-            batch: pixels with their true colours, and rays from the poses of the data. Rays without cameras, such as a
-                teacher's, are not moved.
-            step: number of training steps done.
+        Rays without cameras, such as a teacher's, are not moved.
         """
         if self.poses is not None and batch.rays.camera_indices is not None:
             batch = replace(batch, rays=self.poses(batch.rays))

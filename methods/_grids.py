@@ -22,9 +22,7 @@ class GridsConfig(HashGridConfig):
     """Settings of the hash grids that `--encoding hash-grid` selects."""
 
     RANGES: ClassVar[dict[str, Range]] = {"grid_learning_rate": AT_LEAST_0}
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"grid_width": GRID_WIDTH}
-    """Settings of earlier versions."""
     grid_learning_rate: float = 1e-2
     """Initial learning rate of the hash grids and of the networks on them (hash-grid)."""
 
@@ -42,7 +40,6 @@ def finest_cells(scene: Scene, per_pixel: int = 1) -> Choice:
     """Return the cells along an axis at the finest level: the next power of two that gives each pixel enough.
 
     Args:
-        scene: properties of the whole scene.
         per_pixel: minimum number of cells per pixel of the images' longer side.
     """
     cells = 2 ** (per_pixel * scene.image_size - 1).bit_length()

@@ -108,14 +108,12 @@ class SurfaceConfig(
         "step_widths": AT_LEAST_0,
         "open_levels_until": (0, 1),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {
         "sharpness_learning_rate": SHARPNESS_RATE,
         "color_loss": "squared",
         "curvature_from": 0.0,
         "curvature_until": 0.4,
     }
-    """Settings of earlier versions."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the papers' networks, of 8 layers for the distance and 4 for
     the colour, for GPUs."""
@@ -192,7 +190,6 @@ def make_distance(config: SurfaceConfig, box: Tensor) -> Distance:
     """Return a distance that starts as a ball: a small network on a hash grid, or the papers' network.
 
     Args:
-        config: the method's settings, decided.
         box: (2, 3) corners of the box, scene units.
     """
     radius, width = config.start_radius, config.hidden_width
@@ -208,8 +205,6 @@ def surface_field(
 
     Args:
         kind: class of the field.
-        config: the method's settings, decided.
-        scene: properties of the whole scene.
         sharpness: class of the learnt inverse width.
     """
     box = foreground(config, scene).box
@@ -259,12 +254,7 @@ def make_sampler(config: SurfaceConfig, scene: Scene) -> Sampler:
 
 
 def make_background(config: SurfaceConfig, scene: Scene) -> Field:
-    """Return a field for the outside of the sphere.
-
-    Args:
-        config: the method's settings, decided.
-        scene: properties of the data; not used.
-    """
+    """Return a field for the outside of the sphere."""
     if config.encoding == "frequency":
         return NeRFField(config.hidden_width, dims=4)
     return InvertedField(HashGrid.of(config), config.hidden_width)
@@ -280,6 +270,7 @@ def renderer(config: SurfaceConfig, scene: Scene) -> Renderer:
 class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
     """A model that learns the distance to a surface, its colour, and the poses if asked for."""
 
+    field: SurfaceField
     step_scale: Tensor
     losses = (
         ColorError(),
@@ -300,8 +291,8 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         # Meshes and crops cover the field's box.
         self.scene = replace(scene, box=foreground(config, scene).box)
         self.sphere = foreground_sphere(config, scene) if config.background_model == "sphere" else None
-        edges = self.surface.box[1] - self.surface.box[0]
-        self.surface.cell = float((edges / config.grid_resolution).norm())
+        edges = self.field.box[1] - self.field.box[0]
+        self.field.cell = float((edges / config.grid_resolution).norm())
         self.register_buffer("step_scale", torch.tensor(1.0))
         self._step_scale = HostValue()
         grids, hides = parts(sampler, OccupancySampler), config.hidden_loss_mult > 0 and self.sphere is not None
@@ -318,11 +309,11 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         super().before_step(step, progress)
         if self.hidden is not None:
             self.hidden.settle(step)
-        self.surface.progress, until = progress, self.config.sharpen_until
-        self.surface.sharpness.limit(SHARPER ** (progress / until) if progress < until else math.inf)
+        self.field.progress, until = progress, self.config.sharpen_until
+        self.field.sharpness.limit(SHARPER ** (progress / until) if progress < until else math.inf)
         for sampler in parts(self, OccupancySampler):
             if step % EVERY == 0:
-                width = self.config.step_widths / float(self.surface.sharpness().detach())
+                width = self.config.step_widths / float(self.field.sharpness().detach())
                 scale = min(max(width / sampler.step_size, 1.0), LONGEST)
                 self._step_scale.change(self.step_scale, round(scale * 64) / 64)
             sampler.stride = self._step_scale.of(self.step_scale)
@@ -331,14 +322,11 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
         """Find the imaged space, and let the first ball stand on a floor that a reconstruction's points show.
 
         A floor often has no texture. Nothing then pulls a surface to it, and the background would explain it.
-
-        Args:
-            dataset: the training images.
         """
         if self.hidden is not None and self.sphere is not None:
             least = max(self.config.rays_shared_by, 1)
             self.hidden.show(dataset.cameras, nearest_shown(dataset), least, self.sphere)
-        distance = self.surface.distance
+        distance = self.field.distance
         if self.sphere is None or dataset.points is None or not isinstance(distance, GridDistance):
             return
         sphere, up = self.sphere.to(dataset.points), dataset.points.new_tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -349,19 +337,13 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
             distance.stand_on(floor.normal.to(sphere), floor.center.to(sphere))
             say(f"the first ball stands on a floor, where {floor.share:.0%} of {len(near):,} points lie")
 
-    @property
-    def surface(self) -> SurfaceField:
-        """The field."""
-        assert isinstance(self.field, SurfaceField)
-        return self.field
-
     @torch.no_grad()
     def signed_distance(self, points: Points) -> tuple[Tensor, Tensor]:
         """Return the signed distance (N,) at `points`, scene units, negative inside, and its gradient (N, 3).
 
         The distance is NaN outside the sphere, where the background shows the scene.
         """
-        shape = self.surface.shape(points.positions)
+        shape = self.field.shape(points.positions)
         if self.sphere is None:
             return shape.distances, shape.gradients
         sphere = self.sphere.to(points.positions)
@@ -371,4 +353,4 @@ class SurfaceModel(RefinedModel[SurfaceConfigT], Generic[SurfaceConfigT]):
 
     @property
     def grid_density(self) -> DensityFunction:
-        return self.surface.density_around
+        return self.field.density_around

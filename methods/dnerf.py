@@ -16,7 +16,7 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.deformed import DeformedField
 from nerfloom.fields.encoded import EncodedField
-from nerfloom.fields.nerf import NeRFField
+from nerfloom.fields.nerf import NeRFField, NetworkConfig
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.kernels.grids.hash_grid_layout import MAX_LOG2_TABLE_SIZE, MAX_RESOLUTION
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
@@ -35,6 +35,7 @@ HASH_SAMPLES_PER_BATCH = 2**13
 class DNeRFConfig(
     HierarchicalConfig,
     MotionConfig,
+    NetworkConfig,
     max_num_iterations=800_000,
     num_rays_per_batch=2_048,
     learning_rate=5e-4,
@@ -52,23 +53,17 @@ class DNeRFConfig(
     """
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "num_layers": (3, 64),
-        "hidden_width": (2, 2**14),
-        "position_frequencies": (0, MAX_FREQUENCIES),
-        "direction_frequencies": (0, MAX_FREQUENCIES),
         "time_frequencies": (0, MAX_FREQUENCIES),
         "ambient_dims": (0, 2**10),
         "grid_learning_rate": AT_LEAST_0,
         "max_resolution": (1, MAX_RESOLUTION),
         "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {
         "deformation_width": lambda config: deformation_size(config)[0],
         "deformation_layers": lambda config: deformation_size(config)[1],
         "deformation_frequencies": lambda config: deformation_size(config)[2],
     }
-    """Settings of earlier versions."""
     variant: Literal["d-nerf", "t-nerf"] = "d-nerf"
     """d-nerf: a canonical field and a deformation network. t-nerf: one network of position and time."""
     canonical: Literal["network", "hash-grid"] = "network"
@@ -80,8 +75,6 @@ class DNeRFConfig(
     """Features per layer of the canonical network and of its deformation network."""
     position_frequencies: int = 10
     """Number of frequencies in the encoding of positions, of both networks."""
-    direction_frequencies: int = 4
-    """Number of frequencies in the encoding of directions."""
     time_frequencies: Auto[int] = AUTO
     """Number of frequencies in the encoding of times. auto: 4, or 6 with a hash grid."""
     ambient_dims: Auto[int] = AUTO

@@ -54,7 +54,6 @@ class GaussianSplattingConfig(SplattingConfig):
         "field_depth_mult": AT_LEAST_0,
         "ssim_weight": (0, 1),
     }
-    """Allowed range of each numeric setting."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; the absolute error has the weight 1 - ssim_weight."""
     camera_optimizer: Auto[Literal["off", "SO3xR3", "SE3"]] = AUTO
@@ -72,12 +71,7 @@ GaussianSplattingConfigT = TypeVar("GaussianSplattingConfigT", bound=GaussianSpl
 
 
 def decide(config: GaussianSplattingConfigT, scene: Scene) -> tuple[GaussianSplattingConfigT, list[Decision]]:
-    """Fill in the settings that depend on the budget and the scene.
-
-    Args:
-        config: settings; some may be open.
-        scene: facts about the data.
-    """
+    """Fill in the settings that depend on the budget and the scene."""
     config, made = decide_splatting(config, scene)
     poses = "SO3xR3" if scene.poses == "device" else "off"
     config, more = fill(
@@ -94,10 +88,6 @@ def starting_field(config: GaussianSplattingConfig, scene: Scene) -> Method:
 
     Nerfacto refines the poses in the same way as the Gaussians, or not at all. Instant-ngp cannot: its samples carry no
     gradient to rays.
-
-    Args:
-        config: the decided settings of the Gaussians.
-        scene: facts about the data.
     """
     if not scene.unbounded:
         return load_method("instant-ngp")
@@ -107,11 +97,7 @@ def starting_field(config: GaussianSplattingConfig, scene: Scene) -> Method:
 
 
 class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
-    """A model of Gaussians drawn as whole images.
-
-    Args:
-        scene: facts about the data.
-    """
+    """A model of Gaussians drawn as whole images."""
 
     found: Tensor
     """Whether Gaussians started on the surfaces of a field."""
@@ -130,11 +116,7 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
 
     @torch.no_grad()
     def start(self, dataset: Dataset) -> None:
-        """Set the first Gaussians.
-
-        Args:
-            dataset: images to learn from.
-        """
+        """Set the first Gaussians."""
         kind, count = self.config.start, self.config.start_gaussians
         if kind == "auto":
             kind = "points" if dataset.points is not None else self.start_without_points()
@@ -230,9 +212,6 @@ class GaussianSplatting(GaussianModel[GaussianSplattingConfig]):
         """Return which Gaussians (N,) bool are right before a camera, if a field has shown how near things are.
 
         Only in a scene where every ray ends in the box, with cameras among the things that they show.
-
-        Args:
-            means: (N, 3) centres, scene coordinates.
         """
         poses, found = self.scene.camera_to_worlds, self.found_distances
         if poses is None or not self.scene.ends_in_box:

@@ -73,11 +73,7 @@ class InstantNGPConfig(
 ):
     """Settings of instant-ngp."""
 
-    RANGES: ClassVar[dict[str, Range]] = {
-        "detail": (1, 64),
-        "hidden_width": (1, 2**14),
-    }
-    """Allowed range of each numeric setting."""
+    RANGES: ClassVar[dict[str, Range]] = {"detail": (1, 64), "hidden_width": (1, 2**14)}
     max_resolution: Auto[int] = AUTO
     """Cells per axis at the finest level. auto: a power of two, at least `detail` cells per pixel."""
     detail: Auto[int] = AUTO
@@ -215,11 +211,7 @@ def make_field(config: InstantNGPConfig, scene: Scene) -> EncodedField:
 
 
 def make_background(config: InstantNGPConfig, scene: Scene) -> InvertedField:
-    """Return a field of the same size for the outside of the sphere.
-
-    Args:
-        scene: properties of the data; not used.
-    """
+    """Return a field of the same size for the outside of the sphere."""
     grid = HashGrid.of(config, config.open_levels_until)
     return InvertedField(grid, config.hidden_width, 4 if config.view_dependence else 0)
 

@@ -57,7 +57,6 @@ class KiloNeRFConfig(
         "distill_steps": (0, 1e7),
         "distill_share": (0, 1),
     }
-    """Allowed range of each numeric setting."""
     network_resolution: int = 8
     """Cells along the longest edge of the box, each with a network of its own."""
     hidden_width: int = 32
@@ -84,9 +83,6 @@ class ViewDependence(LossTerm):
     in the step count, because the optimiser updates no others.
     """
 
-    def __init__(self) -> None:
-        super().__init__("view_dependence", "view_dependence_mult")
-
     def __call__(self, shown: RenderedBatch) -> Tensor:
         field, samples = shown.model.field, shown.rendered.samples
         assert isinstance(field, NetworkGrid)
@@ -98,7 +94,7 @@ class ViewDependence(LossTerm):
 class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
     """A model that starts from a teacher's field, if there is a teacher."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, ViewDependence())
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, ViewDependence("view_dependence", "view_dependence_mult"))
 
     def __init__(
         self, config: KiloNeRFConfig, scene: Scene, field: Field, sampler: Sampler, renderer: Renderer
@@ -121,11 +117,7 @@ class KiloNeRF(RayModel[KiloNeRFConfig], plain=True):
             self.teacher = teacher
 
     def start(self, dataset: Dataset) -> None:
-        """Learn the teacher's field, if there is a teacher.
-
-        Args:
-            dataset: the training images.
-        """
+        """Learn the teacher's field, if there is a teacher."""
         if self.teacher is not None:
             box = self.scene.box.to(self.device)
             matter = MatterPoints(self.teacher, box, length_in(box)).around()

@@ -66,7 +66,6 @@ class KPlanesConfig(
         "time_smoothness": AT_LEAST_0,
         "time_sparsity": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     decoder: Literal["hybrid", "explicit"] = "hybrid"
     """hybrid: two small networks. explicit: density linear in the features, and a learnt colour basis."""
     base_resolution: int = 64
@@ -126,9 +125,6 @@ class PlaneRegularity(LossTerm):
     can be captured.
     """
 
-    def __init__(self) -> None:
-        super().__init__("planes")
-
     def __call__(self, shown: RenderedBatch) -> dict[str, Tensor]:
         model, config, zero = shown.model, shown.model.config, shown.rendered.rgb.new_zeros(())
         assert isinstance(model.field, BoxField)
@@ -166,7 +162,7 @@ class PlaneRegularity(LossTerm):
 class KPlanes(RayModel[KPlanesConfig], LearnsMotion, plain=True):
     """A model of feature planes in space and, if the scene moves, in time, with the paper's regularisers."""
 
-    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, PlaneRegularity(), *FEW_IMAGES)
+    losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, PlaneRegularity("planes"), *FEW_IMAGES)
     steps_repeat = True
 
 

@@ -15,16 +15,17 @@ from nerfloom.base.config import Range
 from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.integrated import IntegratedEncoding
 from nerfloom.fields.integrated import IntegratedField
+from nerfloom.fields.nerf import NetworkConfig
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.methods.vanilla_nerf import OCCUPANCY_RATE, OCCUPANCY_SAMPLES_PER_BATCH
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_sampler, decide_samples, make_sampler
-from nerfloom.samplers.proposal import half_edge
 
 
 @dataclass(frozen=True)
 class MipNeRFConfig(
     HierarchicalConfig,
+    NetworkConfig,
     max_num_iterations=1_000_000,
     num_rays_per_batch=4_096,
     learning_rate=5e-4,
@@ -36,21 +37,9 @@ class MipNeRFConfig(
 ):
     """Settings of mip-nerf; the defaults are the paper's, without its warm-up of 2500 steps."""
 
-    RANGES: ClassVar[dict[str, Range]] = {
-        "num_layers": (3, 64),
-        "hidden_width": (2, 2**14),
-        "position_frequencies": (1, MAX_FREQUENCIES),
-        "direction_frequencies": (0, MAX_FREQUENCIES),
-    }
-    """Allowed range of each numeric setting."""
-    num_layers: int = 8
-    """Layers before the density output."""
-    hidden_width: int = 256
-    """Features per layer."""
+    RANGES: ClassVar[dict[str, Range]] = {"position_frequencies": (1, MAX_FREQUENCIES)}
     position_frequencies: int = 16
     """Number of frequencies in the integrated encoding of positions; frequencies finer than a cone average to 0."""
-    direction_frequencies: int = 4
-    """Number of frequencies in the encoding of directions."""
 
 
 class MipNeRF(RayModel[MipNeRFConfig], plain=True):
@@ -69,14 +58,9 @@ def decide(config: MipNeRFConfig, scene: Scene) -> tuple[MipNeRFConfig, list[Dec
 
 def make_field(config: MipNeRFConfig, scene: Scene) -> Field:
     """Return a network like NeRF's on the integrated encoding."""
-    encoding = IntegratedEncoding(
-        scene.box,
-        config.position_frequencies,
-        deviation=half_edge(scene.box) / scene.image_size,
-        contracted=contracted_box(config, scene) is not None,
-    )
+    contracted = contracted_box(config, scene) is not None
     field = IntegratedField(
-        encoding,
+        IntegratedEncoding.of_images(scene, config.position_frequencies, contracted),
         config.hidden_width,
         config.num_layers,
         skip=config.num_layers // 2 + 1,

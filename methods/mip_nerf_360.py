@@ -21,6 +21,7 @@ from nerfloom.base.optimised import Optimised
 from nerfloom.encodings.integrated import IntegratedEncoding, icosahedron_directions
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.integrated import IntegratedDensity, IntegratedField
+from nerfloom.fields.nerf import NetworkConfig
 from nerfloom.fields.sized import SizedDensity, SizedField
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.losses.functions import charbonnier
@@ -42,7 +43,7 @@ from nerfloom.samplers.choice import (
     make_sampler,
     samples_choices,
 )
-from nerfloom.samplers.proposal import LEARN_EVERY, half_edge
+from nerfloom.samplers.proposal import LEARN_EVERY
 
 DISTORTION = 0.01
 """Default weight of the distortion loss in unbounded scenes, the paper's."""
@@ -57,6 +58,7 @@ PROPOSAL_LEVELS, PROPOSAL_BASE, PROPOSAL_TABLE = 5, 16, 16
 class MipNeRF360Config(
     GridsConfig,
     ProposedConfig,
+    NetworkConfig,
     max_num_iterations=250_000,
     num_rays_per_batch=2_048,
     learning_rate=2e-3,
@@ -73,18 +75,13 @@ class MipNeRF360Config(
     """
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "num_layers": (3, 64),
-        "hidden_width": (2, 2**14),
         "position_frequencies": (1, MAX_FREQUENCIES),
-        "direction_frequencies": (0, MAX_FREQUENCIES),
         "distortion_loss_mult": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {
         "proposal_width": lambda config: proposal_size(config)[0],
         "proposal_layers": lambda config: proposal_size(config)[1],
     }
-    """Settings of earlier versions."""
     encoding: Auto[Literal["integrated", "hash-grid"]] = AUTO
     """integrated: the paper's networks. hash-grid: hash grids with small networks. auto: hash-grid on a CPU."""
     distortion_loss_mult: Auto[float] = AUTO
@@ -180,13 +177,8 @@ def make_proposals(config: MipNeRF360Config, scene: Scene) -> Sequence[Field]:
 
 
 def _encoding(config: MipNeRF360Config, scene: Scene) -> IntegratedEncoding:
-    return IntegratedEncoding(
-        scene.box,
-        config.position_frequencies,
-        deviation=half_edge(scene.box) / scene.image_size,
-        contracted=contracted_box(config, scene) is not None,
-        directions=icosahedron_directions(),
-    )
+    contracted = contracted_box(config, scene) is not None
+    return IntegratedEncoding.of_images(scene, config.position_frequencies, contracted, icosahedron_directions())
 
 
 def sampler(config: MipNeRF360Config, scene: Scene) -> Sampler:

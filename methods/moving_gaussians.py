@@ -41,9 +41,7 @@ class MovingGaussiansConfig(GaussianSplattingConfig, noise=0.0, opacity_penalty=
         "start_duration": DURATIONS,
         "min_duration": DURATIONS,
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"moment_rate": MOMENT_RATE, "duration_rate": DURATION_RATE}
-    """Settings of earlier versions."""
     velocity_rate: float = 1.6e-3
     """Learning rate of velocities, in sizes of the scene for the time from 0 to 1, before --rate-factor."""
     start_duration: float = 0.1
@@ -87,11 +85,7 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
         }
 
     def set_gaussians(self, gaussians: Gaussians) -> None:
-        """Replace the Gaussians.
-
-        Args:
-            gaussians: the new ones at rest. Those without motion stand still, at random moments, for a long time.
-        """
+        """Replace the Gaussians. New ones without motion stand still, at random moments, for a long time."""
         if self.scene.moving:
             usual = still(gaussians, max(self.config.start_duration, self.config.min_duration))
             gaussians = replace(gaussians, extras={**usual, **gaussians.extras})
@@ -111,11 +105,7 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
         return gaussians if time is None else shown_at(gaussians, time)
 
     def gaussians(self, time: float | None = None) -> Gaussians:
-        """Return the Gaussians at a time that have not faded, without gradient.
-
-        Args:
-            time: in [0, 1]; None for all of them, at rest.
-        """
+        """Return the Gaussians at a time that have not faded, without gradient; without a time all of them, at rest."""
         found = super().gaussians(time)
         # Gaussians with NaN stay here: callers count and report them.
         return found if time is None else found[~(torch.sigmoid(found.logits) <= MIN_ALPHA)]
@@ -124,10 +114,6 @@ class MovingGaussians(GaussianSplatting, LearnsMotion):
         """Return the opacities (N,) at a time as the paper's 4D regularisation counts them.
 
         The factor of time has no gradient. Otherwise the penalty would shorten durations.
-
-        Args:
-            gaussians: N Gaussians at the time, with gradient.
-            time: in [0, 1]; None for a still scene.
         """
         if time is None:
             return super().penalised_opacities(gaussians, time)

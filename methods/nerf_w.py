@@ -18,12 +18,13 @@ from nerfloom import Decision, Method, Picture, PixelBatch, RayModel, Rays, Rend
 from nerfloom.base.config import AT_LEAST_0, Range, VectorConfig
 from nerfloom.base.decisions import Choice, fill
 from nerfloom.base.optimised import Optimised
-from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.planes import FeaturePlanes, resolutions_of, scales_for
 from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.losses.functions import doubted_error
 from nerfloom.losses.term import LossTerm, RenderedBatch
 from nerfloom.losses.terms import KNOWN_DISTANCES, Distortion, SamplerLoss
@@ -31,7 +32,6 @@ from nerfloom.methods._captures import CaptureConfig, RefinedModel, decide_captu
 from nerfloom.rendering.transient import STATIC, UNCERTAINTY, TransientRenderer
 from nerfloom.rendering.volume import scaled_up_to
 from nerfloom.samplers.choice import decide_samples, make_sampler
-from nerfloom.samplers.proposal import half_edge
 
 PAPER_WIDTH, GRID_WIDTH = 256, 64
 """Features per hidden layer: the paper's networks, with half as many in their heads, and networks on a hash grid."""
@@ -49,21 +49,7 @@ SAMPLES = 2**15
 
 
 @dataclass(frozen=True)
-class NerfWConfig(
-    HashGridConfig,
-    CaptureConfig,
-    VectorConfig,
-    max_num_iterations=30_000,
-    num_rays_per_batch=2_048,
-    learning_rate=1e-2,
-    lr_schedule="hold-exponential",
-    lr_final=0.02,
-    adam_beta2=0.99,
-    adam_eps=1e-15,
-    eval_num_rays_per_chunk=4_096,
-    appearance_embedding_dim=48,
-    robust="off",
-):
+class NerfWConfig(CaptureConfig, VectorConfig, max_num_iterations=30_000, appearance_embedding_dim=48, robust="off"):
     """Settings of nerf-w; open ones depend on the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {
@@ -71,7 +57,6 @@ class NerfWConfig(
         "least_uncertainty": (1e-4, 1e4),
         "transient_density_mult": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     encoding: Literal["hash-grid", "planes", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. planes: the same on the feature planes of K-Planes. frequency: the
     paper's networks, of 8 layers of 256 features."""
@@ -86,9 +71,6 @@ class NerfWConfig(
 class DoubtedError(LossTerm):
     """Error of colours in units of their uncertainty."""
 
-    def __init__(self) -> None:
-        super().__init__("rgb")
-
     def __call__(self, shown: RenderedBatch) -> Tensor:
         pixels, batch = shown.pixels, shown.batch
         least = shown.model.config.least_uncertainty
@@ -98,9 +80,6 @@ class DoubtedError(LossTerm):
 class TransientDensity(LossTerm):
     """Mean transient density, per half edge of the box: NeRF-W, equation 13, in the unit of `doubted_error`."""
 
-    def __init__(self) -> None:
-        super().__init__("transient", "transient_density_mult")
-
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         density = shown.rendered.extras.get("transient_density")  # None for the views of a teacher
         unit = 2 * shown.model.config.least_uncertainty**2 * half_edge(shown.model.scene.box)
@@ -109,9 +88,6 @@ class TransientDensity(LossTerm):
 
 class PlaneVariation(LossTerm):
     """Total variation of feature planes: K-Planes, equation 4; from a random band of rows of each, without bias."""
-
-    def __init__(self) -> None:
-        super().__init__("planes", PLANE_VARIATION)
 
     def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
         return bool(model.config.encoding == "planes")
@@ -124,7 +100,14 @@ class PlaneVariation(LossTerm):
 class NerfW(RefinedModel[NerfWConfig], plain=True):
     """A model that gives less weight to an image where the others disagree with it."""
 
-    losses = (DoubtedError(), TransientDensity(), SamplerLoss(), *KNOWN_DISTANCES, Distortion(), PlaneVariation())
+    losses = (
+        DoubtedError("rgb"),
+        TransientDensity("transient", "transient_density_mult"),
+        SamplerLoss(),
+        *KNOWN_DISTANCES,
+        Distortion(),
+        PlaneVariation("planes", PLANE_VARIATION),
+    )
     renderer: TransientRenderer
 
     def lit(self, rendered: Rendered, rays: Rays, background: Tensor) -> Rendered:

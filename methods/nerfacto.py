@@ -29,7 +29,7 @@ from nerfloom import (
 )
 from nerfloom.base.config import AUTO, Range, VectorConfig
 from nerfloom.base.decisions import Choice, fill
-from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.appearance import make_vectors
 from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import NUM_FEATURES, EncodedField
@@ -52,27 +52,16 @@ THIN = 0.5
 
 @dataclass(frozen=True)
 class NerfactoConfig(
-    HashGridConfig,
     CaptureConfig,
     FewImagesConfig,
     VectorConfig,
     DensityDirectionalConfig,
     max_num_iterations=30_000,
-    num_rays_per_batch=2_048,
-    learning_rate=1e-2,
-    lr_schedule="hold-exponential",
-    lr_final=0.02,
-    adam_beta2=0.99,
-    adam_eps=1e-15,
-    eval_num_rays_per_chunk=4_096,
     thin_gradients=AUTO,
 ):
     """Settings of nerfacto; open ones depend on the scene."""
 
-    RANGES: ClassVar[dict[str, Range]] = {
-        "hidden_width": (1, 2**14),
-    }
-    """Allowed range of each numeric setting."""
+    RANGES: ClassVar[dict[str, Range]] = {"hidden_width": (1, 2**14)}
     predict_normals: bool = False
     """Whether to predict normals, which are smoother than normals from the density's gradient. --directional reflected
     always does."""

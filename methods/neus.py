@@ -28,7 +28,6 @@ class NeuSConfig(SurfaceConfig):
     """Settings of neus."""
 
     RANGES: ClassVar[dict[str, Range]] = {"anneal_slope_until": (0, 1)}
-    """Allowed range of each numeric setting."""
     anneal_slope_until: float = 0.5
     """Fraction of the budget until the annealing of the slope ends (`surface_opacity`)."""
 
@@ -36,10 +35,11 @@ class NeuSConfig(SurfaceConfig):
 class NeuS(SurfaceModel[NeuSConfig]):
     """A model with the opacity of NeuS, equation 13."""
 
+    field: NeuSField
+
     def before_step(self, step: int, progress: float) -> None:
         super().before_step(step, progress)
         until = self.config.anneal_slope_until
-        assert isinstance(self.field, NeuSField)
         self.field.sharpness.anneal(round(min(progress / until, 1.0) * 1024) / 1024 if until else 1.0)
 
 
@@ -57,4 +57,3 @@ METHOD = Method(
     model=NeuS,
     decide=decide_surface,
 )
-"""The method."""

@@ -38,9 +38,9 @@ from nerfloom.data.pixels.batch import composite
 from nerfloom.data.source_views import images_of, nearest_in_direction, other_images
 from nerfloom.encodings.pixel_aligned import ImageEncoder, SourceViews
 from nerfloom.fields.pixel_aligned import PixelAlignedField
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
 from nerfloom.samplers.hierarchical import MIN_COARSE, HierarchicalSampler
-from nerfloom.samplers.proposal import half_edge
 
 BLOCKS_BEFORE, BLOCKS_AFTER = 3, 2
 """Residual blocks before and after the mean over views, as in the paper."""
@@ -65,9 +65,7 @@ class PixelNeRFConfig(
         "position_frequencies": (0, MAX_FREQUENCIES),
         "encoder_widths": (1, 2**14),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"num_view_blocks": BLOCKS_BEFORE}
-    """Settings of earlier versions."""
     num_coarse_samples: int = 32
     """Stratified intervals per ray (64 in the paper)."""
     num_fine_samples: int = 32
@@ -81,13 +79,7 @@ class PixelNeRFConfig(
 
 
 class PixelNeRF(RayModel[PixelNeRFConfig]):
-    """A model of many scenes: the encoder takes images of a scene, and the field looks up their features.
-
-    Args:
-        field: the conditioned network.
-        sampler: chooses the positions along each ray.
-        renderer: turns samples into colours and depths.
-    """
+    """A model of many scenes: the encoder takes images of a scene, and `field` looks up their features."""
 
     field: PixelAlignedField
 
@@ -182,12 +174,7 @@ class PixelNeRF(RayModel[PixelNeRFConfig]):
     # -- learning and rendering -------------------------------------------------------------------------------
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the loss of pixels of a few images; each image is rendered from others of its scene.
-
-        Args:
-            batch: pixels with their true colours.
-            step: number of training steps done.
-        """
+        """Return the loss of pixels of a few images; each image is rendered from others of its scene."""
         assert batch.rays.camera_indices is not None
         images = batch.rays.camera_indices[:: batch.rays_per_pixel]
         num_samples: int | Tensor = 0

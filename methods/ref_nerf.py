@@ -24,7 +24,6 @@ from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.methods._grids import finest_cells
 from nerfloom.samplers.choice import HierarchicalConfig, contracted_box, decide_samples, make_sampler
-from nerfloom.samplers.proposal import half_edge
 
 SAMPLES = {"hash-grid": 2**15, "frequency": 2**12}
 """Samples per training step with an occupancy grid."""
@@ -62,7 +61,6 @@ class RefNeRFConfig(
         "position_frequencies": (1, MAX_FREQUENCIES),
         "open_levels_until": (0, 1),
     }
-    """Allowed range of each numeric setting."""
     encoding: Literal["hash-grid", "frequency"] = "hash-grid"
     """hash-grid: small networks on a hash grid. frequency: the paper's networks of 8 layers, for GPUs."""
     max_resolution: Auto[int] = AUTO
@@ -122,12 +120,7 @@ def make_field(config: RefNeRFConfig, scene: Scene) -> Field:
     if config.encoding == "hash-grid":
         grid, reflection = HashGrid.of(config, config.open_levels_until), Reflection.small(width, bottleneck, bands)
         return EncodedField(scene.box, grid, width, unbounded=unbounded, reflection=reflection)
-    encoding = IntegratedEncoding(
-        scene.box,
-        config.position_frequencies,
-        deviation=half_edge(scene.box) / scene.image_size,
-        contracted=unbounded,
-    )
+    encoding = IntegratedEncoding.of_images(scene, config.position_frequencies, unbounded)
     inputs = Reflection.num_inputs(bottleneck, bands)
     directional = SkippingNetwork(inputs, width, DEPTH, DIRECTIONAL_SKIP, 3, "sigmoid")
     return ReflectiveNetworks(encoding, Reflection(directional, bottleneck, bands), width, DEPTH)

@@ -66,9 +66,7 @@ class TensoRFConfig(
         "total_variation": AT_LEAST_0,
         "hidden_width": (1, 2**14),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"network_learning_rate": NETWORK_RATE}
-    """Settings of earlier versions."""
     decomposition: Literal["vm", "cp"] = "vm"
     """vm: planes and lines. cp: lines only, which take less than 4 MB and learn more slowly."""
     density_components: Auto[int] = AUTO
@@ -97,7 +95,7 @@ class Sparsity(LossTerm):
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
         model = shown.model
         assert isinstance(model, TensoRF)
-        factors, share = model.factors.density_factors, 0.5 if model.has_grown else 1.0
+        factors, share = model.field.density_factors, 0.5 if model.has_grown else 1.0
         bands = factors.bands(factors.all_factors)
         return share * torch.stack([band.abs().mean() for band in bands]).sum()
 
@@ -117,14 +115,9 @@ REGULARISERS = Sparsity("sparsity", "sparsity"), TotalVariation("total_variation
 
 
 class TensoRF(RayModel[TensoRFConfig], plain=True):
-    """A model with factors that grow from coarse to fine; with an occupancy grid, their box shrinks to occupied space.
+    """A model with factors that grow from coarse to fine; an occupancy grid also shrinks their box around matter."""
 
-    Args:
-        field: the `TensorField`.
-        sampler: chooses the samples along rays.
-        renderer: turns samples into colours and depths.
-    """
-
+    field: TensorField
     growths: Tensor
     """Number of growths so far."""
     losses = (COLOR_ERROR, SamplerLoss(), *KNOWN_DISTANCES, *REGULARISERS, *FEW_IMAGES)
@@ -139,12 +132,6 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
     def has_grown(self) -> bool:
         """True if the grid has grown at least once."""
         return self._growths.of(self.growths) > 0
-
-    @property
-    def factors(self) -> TensorField:
-        """The field with the factors to resample."""
-        assert isinstance(self.field, TensorField)
-        return self.field
 
     def before_step(self, step: int, progress: float) -> None:
         if step >= BLIND_STEPS or not isinstance(self.sampler, SkipsCells):
@@ -167,7 +154,7 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
     def _grow(self, share: float) -> None:
         """Resample the factors over the occupied box, with first^(1 - share) * last^share vertices."""
         voxels = self.config.first_voxels ** (1 - share) * self.config.last_voxels**share
-        box, field = self._occupied_box(), self.factors
+        box, field = self._occupied_box(), self.field
         vertices = cubic_vertices(voxels, box)
         if torch.equal(box, field.box) and vertices == field.density_factors.layout.resolutions[0]:
             return
@@ -182,8 +169,8 @@ class TensoRF(RayModel[TensoRFConfig], plain=True):
 
         With nested boxes the field contracts space and keeps its box.
         """
-        sampler, box = self.sampler, self.factors.box
-        if not isinstance(sampler, SkipsCells) or self.factors.unbounded:
+        sampler, box = self.sampler, self.field.box
+        if not isinstance(sampler, SkipsCells) or self.field.unbounded:
             return box.clone()
         cells = sampler.occupied.view((sampler.resolution,) * 3)
         around = box_around_cells(cells, sampler.box, MARGIN)

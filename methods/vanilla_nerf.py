@@ -9,15 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 from torch import Tensor
 
 from nerfloom import Decision, Method, RayModel, Sampler, Scene
-from nerfloom.base.config import Range
 from nerfloom.base.optimised import Optimised
-from nerfloom.fields.nerf import NeRFField
-from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES
+from nerfloom.fields.nerf import NeRFField, NetworkConfig
 from nerfloom.losses.few_images import FewImagesConfig, decide_few_images
 from nerfloom.losses.terms import COLOR_ERROR, FEW_IMAGES, KNOWN_DISTANCES, CoarseColorError, SamplerLoss
 from nerfloom.rendering.background import background_renderer
@@ -41,6 +38,7 @@ class VanillaNeRFConfig(
     HierarchicalConfig,
     BackgroundConfig,
     FewImagesConfig,
+    NetworkConfig,
     max_num_iterations=200_000,
     num_rays_per_batch=4_096,
     learning_rate=5e-4,
@@ -50,22 +48,6 @@ class VanillaNeRFConfig(
     num_steps=192,
 ):
     """Settings of vanilla-nerf; the defaults are the paper's."""
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        "num_layers": (3, 64),
-        "hidden_width": (2, 2**14),
-        "position_frequencies": (0, MAX_FREQUENCIES),
-        "direction_frequencies": (0, MAX_FREQUENCIES),
-    }
-    """Allowed range of each numeric setting."""
-    num_layers: int = 8
-    """Layers before the density output."""
-    hidden_width: int = 256
-    """Features per layer."""
-    position_frequencies: int = 10
-    """Number of frequencies in the encoding of positions."""
-    direction_frequencies: int = 4
-    """Number of frequencies in the encoding of directions."""
 
 
 def decide(config: VanillaNeRFConfig, scene: Scene) -> tuple[VanillaNeRFConfig, list[Decision]]:
@@ -82,11 +64,7 @@ def make_field(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
 
 
 def make_background(config: VanillaNeRFConfig, scene: Scene) -> NeRFField:
-    """Return the network for the outside of the sphere, at points of the inverted sphere.
-
-    Args:
-        scene: properties of the data; not used.
-    """
+    """Return the network for the outside of the sphere, at points of the inverted sphere."""
     return _network(config, dims=4)
 
 

@@ -31,9 +31,7 @@ class VolSDFConfig(SurfaceConfig, step_widths=0.0):
     """Settings of volsdf."""
 
     samplers: ClassVar[tuple[str, ...]] = ("occupancy", "error-bounded")
-    """Samplers that suit the method."""
     RANGES: ClassVar[dict[str, Range]] = {"num_bound_steps": (4, 2**12), "opacity_error": (1e-4, 1)}
-    """Allowed range of each numeric setting."""
     sampler: Auto[Literal["occupancy", "error-bounded"]] = AUTO  # type: ignore[assignment]
     """occupancy: march through the occupied cells of the box. error-bounded: draw --num-nerf-samples samples per ray
     from an opacity with a bounded error, as in the paper. auto: occupancy."""
@@ -78,4 +76,3 @@ METHOD = Method(
     model=VolSDF,
     decide=decide_surface,
 )
-"""The method."""

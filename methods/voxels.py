@@ -75,9 +75,7 @@ class VoxelsConfig(
         "prune_weight": (0, 1),
         "total_variation": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"silhouette_pixels": True, "density_rate": DENSITY_RATE}
-    """Settings of earlier versions."""
     resolution: Auto[int] = AUTO
     """Cells along the longest edge of the box that silhouettes leave, at the end of training. auto: chosen from the
     images and the training time."""
@@ -123,10 +121,6 @@ def first_cells(cells: int, num_splits: int) -> int:
 class Voxels(OctreeModel[VoxelsConfig]):
     """An octree with leaves that become smaller and fewer during training.
 
-    Args:
-        config: the settings.
-        scene: the scene.
-
     Raises:
         ConfigError: if a setting has no meaning here, or there are too many leaves to begin with.
     """
@@ -156,11 +150,7 @@ class Voxels(OctreeModel[VoxelsConfig]):
         self._begin(first)
 
     def start(self, dataset: Dataset) -> None:
-        """Set the first leaves: fog wherever the images' silhouettes allow matter, or in the whole box.
-
-        Args:
-            dataset: the training images; not used, since their silhouettes have carved `hull`.
-        """
+        """Set the first leaves: fog wherever `hull`, which silhouettes have carved, allows matter."""
         self._begin(first_cells(self.config.resolution, self.config.num_splits))
 
     @torch.no_grad()
@@ -173,12 +163,7 @@ class Voxels(OctreeModel[VoxelsConfig]):
         self.set_octree(layout, raw, coefficients.flatten(1))
 
     def loss(self, batch: PixelBatch, step: int) -> Loss:
-        """Return the error of colours and, in some steps, the total variation of some leaves.
-
-        Args:
-            batch: pixels with their true colours, and rays in the frame of the scene.
-            step: number of training steps done.
-        """
+        """Return the error of colours and, in some steps, the total variation of some leaves."""
         loss = super().loss(batch, step)
         if self.training:
             self._look(batch.rays[::RAYS_PER_LOOK])

@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 from nerfloom import ConfigError, Decision, Method, Sampler, Scene
 from nerfloom.base.config import AT_LEAST_0, Range
 from nerfloom.base.decisions import is_open
-from nerfloom.encodings.hash_grid import HashGrid, HashGridConfig
+from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.encodings.multisampled import MultisampledHashGrid
 from nerfloom.fields.directional import DensityDirectionalConfig, reflection_of
 from nerfloom.fields.encoded import DensityField
@@ -30,7 +30,6 @@ from nerfloom.losses.normals import PREDICTED_NORMALS
 from nerfloom.losses.terms import COLOR_ERROR, KNOWN_DISTANCES, Distortion, SamplerLoss
 from nerfloom.methods._captures import PAPER_SAMPLES, CaptureConfig, RefinedModel, decide_capture
 from nerfloom.samplers.choice import decide_samples, make_sampler
-from nerfloom.samplers.proposal import ProposalSampler
 
 POWER_LADDER = -1.5
 """Exponent of the power ladder that spaces distances if space is contracted, the paper's for all scenes."""
@@ -42,17 +41,9 @@ SAMPLES_PER_BATCH = 2**14
 
 @dataclass(frozen=True)
 class ZipNeRFConfig(
-    HashGridConfig,
     CaptureConfig,
     DensityDirectionalConfig,
     max_num_iterations=25_000,
-    num_rays_per_batch=2_048,
-    learning_rate=1e-2,
-    lr_schedule="hold-exponential",
-    lr_final=0.02,
-    adam_beta2=0.99,
-    adam_eps=1e-15,
-    eval_num_rays_per_chunk=4_096,
     num_steps=256,
     num_levels=8,
     features_per_level=4,
@@ -67,9 +58,7 @@ class ZipNeRFConfig(
         "proposal_log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
         "hidden_width": (1, 2**14),
     }
-    """Allowed range of each numeric setting."""
     GONE: ClassVar[dict[str, Any]] = {"power_ladder": POWER_LADDER, "num_proposal_levels": PROPOSAL_LEVELS}
-    """Settings of earlier versions."""
     changing_light = "affine"
     interlevel_blurs: tuple[float, ...] = (0.03, 0.003)
     """Radius of the box filter on the samples' histogram in each proposal's loss, in normalised distance."""
@@ -119,8 +108,6 @@ def make_field(config: ZipNeRFConfig, scene: Scene) -> MultisampledField:
 def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
     """Return proposals with the anti-aliased loss for `scene`, or the sampler named by `config`."""
     scene = replace(scene, unbounded=config.contraction)
-    if config.sampler != "proposal":
-        return make_sampler(config, scene)
 
     def proposal(finest: int) -> DensityField:
         features = 1 if config.multisampled_proposals else 2
@@ -130,17 +117,8 @@ def sampler(config: ZipNeRFConfig, scene: Scene) -> Sampler:
         grid = MultisampledHashGrid(*sizes, config.sparse_updates, config.hash_decay_mult)
         return MultisampledDensity(scene.box, grid, unbounded=scene.unbounded)
 
-    made = ProposalSampler(
-        scene.box,
-        (*config.num_proposal_samples, config.num_nerf_samples),
-        unbounded=scene.unbounded,
-        endless=scene.unbounded and not scene.has_alpha,
-        fields=[proposal(finest) for finest in config.proposal_resolutions],
-        ladder=POWER_LADDER,
-        blurs=config.interlevel_blurs,
-    )
-    made.samples_per_step = config.samples_per_batch
-    return made
+    proposals = [proposal(finest) for finest in config.proposal_resolutions] if config.sampler == "proposal" else None
+    return make_sampler(config, scene, proposals=proposals, ladder=POWER_LADDER, blurs=config.interlevel_blurs)
 
 
 METHOD = Method(

@@ -10,12 +10,12 @@ from torch import Tensor
 from nerfloom import Field, Points, Rays, Sampler, Samples
 from nerfloom.fields.nerf import NeRFField
 from nerfloom.fields.transient import TransientHead
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.losses.functions import doubted_error
 from nerfloom.losses.term import RenderedBatch
 from nerfloom.methods import nerf_w
 from nerfloom.methods.nerf_w import START
 from nerfloom.rendering.transient import TransientRenderer
-from nerfloom.samplers.proposal import half_edge
 from nerfloom.testing import assert_method
 from nerfloom.testing.scenes import ball_in_a_box
 from nerfloom.training.optim import make_optimizer
@@ -234,11 +234,11 @@ def test_planes_have_a_vertex_for_each_pixel_and_their_variation_counts() -> Non
     expected = torch.stack(steps).sum() / (2 * len(factors))
     batch = RenderedBatch(batch=None, rendered=None, model=model, step=0)  # type: ignore[arg-type]
     torch.manual_seed(0)
-    found = torch.stack([nerf_w.PlaneVariation()(batch).detach() for _ in range(50)]).mean()
+    found = torch.stack([nerf_w.PlaneVariation("planes")(batch).detach() for _ in range(50)]).mean()
     assert float(found) == pytest.approx(float(expected), rel=0.05)  # a band of one row has no steps
-    assert nerf_w.PlaneVariation().applies(batch.batch, model)
+    assert nerf_w.PlaneVariation("planes").applies(batch.batch, model)
     model.config = dataclasses.replace(config, encoding="hash-grid")
-    assert not nerf_w.PlaneVariation().applies(batch.batch, model)
+    assert not nerf_w.PlaneVariation("planes").applies(batch.batch, model)
 
 
 @pytest.mark.slow

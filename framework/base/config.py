@@ -214,7 +214,6 @@ class AppearanceConfig(TrainConfig):
     """
 
     RANGES: ClassVar[dict[str, Range]] = {"mean_appearance_share": (0, 1)}
-    """Allowed ranges."""
     appearance: Auto[AppearanceKind] = AUTO
     """How images differ. none: not at all; vector: by an input of the colour network; affine: by an affine function of
     colours; tone: by exposure and white balance, through a tone curve of each camera; grid: by affine functions that
@@ -237,7 +236,6 @@ class VectorConfig(AppearanceConfig):
     """Settings of a method with a colour network that can take a vector of each image."""
 
     RANGES: ClassVar[dict[str, Range]] = {"appearance_embedding_dim": (1, 2**10)}
-    """Allowed ranges."""
     appearance_embedding_dim: int = 16
     """Length of each image's vector (--appearance vector)."""
     changing_light = "vector"
@@ -258,7 +256,6 @@ class RayConfig(RobustConfig, AppearanceConfig):
         "rays_shared_by": (0, 100),
         "thin_gradients": (0, 16),
     }
-    """Allowed ranges."""
     num_rays_per_batch: int = 4_096
     """Rays per training step; the maximum with --max-seconds, see --steps-per-ray."""
     steps_per_ray: float = 1.0
@@ -293,7 +290,6 @@ class SourceViewsConfig(RayConfig):
     """Settings of a method that renders from images of the scene."""
 
     RANGES: ClassVar[dict[str, Range]] = {"num_source_views": (1, 64), "images_per_batch": (1, 1024)}
-    """Allowed ranges."""
     num_source_views: int = 3
     """Number of images that a view is rendered from."""
     images_per_batch: int = 4

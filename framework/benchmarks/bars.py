@@ -10,19 +10,11 @@ from nerfloom.benchmarks.kernels import UNITS, Row
 from nerfloom.comparison import plots
 
 
-def draw(rows: Sequence[Row], path: Path) -> bool:
-    """Draw the times of kernels, forward and backward together, ns on a logarithmic axis.
-
-    Args:
-        rows: measurements with one number of threads.
-        path: file to write; its folder is created if missing.
-
-    Returns:
-        Whether it was drawn; False if matplotlib is not installed, which is reported.
-    """
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Draw the times of kernels in `rows`, ns on a logarithmic axis, to the file `path`, or report why not."""
     if not plots.available():
         say(plots.MISSING)
-        return False
+        return
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 0.42 * len(rows) + 1), layout="constrained")
@@ -43,4 +35,3 @@ def draw(rows: Sequence[Row], path: Path) -> bool:
     axes.legend(fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
-    return True

@@ -50,19 +50,22 @@ def of_function(
     reference: Callable[..., Tensor],
     work: Work,
     backward: bool = True,
+    unit: str = "sample",
+    count: int | None = None,
 ) -> Kernel:
-    """Return the kernel `name`, a function of tensors with a row per sample in its first argument.
+    """Return the kernel `name`, a function of tensors.
 
     Args:
         inputs: arguments of both functions.
         compiled, reference: the functions.
-        work: work of the forward pass per sample.
+        work: work of the forward pass per unit.
         backward: whether to measure the backward pass too.
+        unit, count: as in `Kernel`; if `count` is None, a row of the first argument is a unit.
     """
     return Kernel(
         name,
-        "sample",
-        len(inputs[0]),
+        unit,
+        len(inputs[0]) if count is None else count,
         (differentiated(compiled, inputs, None, backward), differentiated(reference, inputs, None, backward)),
         work,
         lambda: (errors(compiled, reference, inputs, backward), errors(reference, reference, inputs, backward)),

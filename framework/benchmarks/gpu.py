@@ -159,31 +159,31 @@ def along_rays(count: int) -> Iterator[Kernel]:
         lambda w: distortion_reference(w, packed(w)),
         Work(bytes=4 * 3),
     )
-    each_ray = [
-        of_function(
-            f"weights of {BINS} intervals",
-            [torch.rand(rays, BINS) * 9],
-            lambda sigma: interval_weights(sigma, edges),
-            lambda sigma: interval_weights_reference(sigma, edges.to(sigma)),
-            Work(bytes=4 * 3 * BINS),
-        ),
-        of_function(
-            f"resampling of {BINS} intervals",
-            [edges, weights, torch.rand(rays)],
-            lambda t, w, shift: resample(t, w, shift, BINS, 1.0, 0.01),
-            lambda t, w, shift: resample_reference(t, w, shift, BINS, 1.0, 0.01),
-            Work(bytes=4 * 3 * BINS),
-            backward=False,
-        ),
-        of_function(
-            f"loss of a proposal of {BINS} intervals",
-            [weights.flip(-1) / 2],
-            lambda p: proposal_excess(edges, weights, edges, p),
-            lambda p: proposal_excess_reference(edges.to(p), weights.to(p), edges.to(p), p),
-            Work(bytes=4 * 4 * BINS),
-        ),
-    ]
-    yield from (replace(kernel, unit="ray") for kernel in each_ray)
+    yield of_function(
+        f"weights of {BINS} intervals",
+        [torch.rand(rays, BINS) * 9],
+        lambda sigma: interval_weights(sigma, edges),
+        lambda sigma: interval_weights_reference(sigma, edges.to(sigma)),
+        Work(bytes=4 * 3 * BINS),
+        unit="ray",
+    )
+    yield of_function(
+        f"resampling of {BINS} intervals",
+        [edges, weights, torch.rand(rays)],
+        lambda t, w, shift: resample(t, w, shift, BINS, 1.0, 0.01),
+        lambda t, w, shift: resample_reference(t, w, shift, BINS, 1.0, 0.01),
+        Work(bytes=4 * 3 * BINS),
+        backward=False,
+        unit="ray",
+    )
+    yield of_function(
+        f"loss of a proposal of {BINS} intervals",
+        [weights.flip(-1) / 2],
+        lambda p: proposal_excess(edges, weights, edges, p),
+        lambda p: proposal_excess_reference(edges.to(p), weights.to(p), edges.to(p), p),
+        Work(bytes=4 * 4 * BINS),
+        unit="ray",
+    )
 
 
 def timed_steps(device: torch.device, before: int, steps: int, **settings: Any) -> list[dict[str, Any]]:

@@ -79,11 +79,7 @@ class Row:
 
 
 def measure(samples: int, repeats: int) -> tuple[list[Row], dict[str, Any]]:
-    """Measure every kernel and print a table.
-
-    Args:
-        samples: number of samples in a batch.
-        repeats: number of runs for medians.
+    """Measure every kernel in `repeats` runs with batches of `samples`, and print a table of medians.
 
     Returns:
         The rows, and rows, machine and limits as plain data.
@@ -260,14 +256,8 @@ def _blurring(rays: int) -> Kernel:
     def exact(p: Tensor) -> Tensor:
         return blurred_excess_reference(edges.to(p), weights.to(p), proposed.to(p), p, 0.01)
 
-    return Kernel(
-        "loss of proposals, blurred, 32 against 64",
-        "ray",
-        rays,
-        (differentiated(ours, [given], None), differentiated(exact, [given], None)),
-        Work(bytes=4 * (33 + 32 + 65 + 64 + 64 + 1)),  # both histograms read, the loss and its derivative written
-        lambda: (errors(ours, exact, [given], True), errors(exact, exact, [given], True)),
-    )
+    work = Work(bytes=4 * (33 + 32 + 65 + 64 + 64 + 1))  # both histograms read, the loss and its derivative written
+    return of_function("loss of proposals, blurred, 32 against 64", [given], ours, exact, work, unit="ray")
 
 
 def _network(count: int, widths: tuple[int, ...], activation: Activation, bfloat16: bool) -> Described:
@@ -375,14 +365,8 @@ def _similarity() -> Kernel:
         return lambda x: form(x, target.to(x), 0.2)
 
     ours, exact = against(photometric_loss), against(photometric_reference)
-    return Kernel(
-        "loss with SSIM, 400 x 400 x 3",
-        "pixel",
-        400 * 400,
-        (differentiated(ours, [image], None), differentiated(exact, [image], None)),
-        Work(bytes=4 * 3 * 3),  # both images read, a gradient written
-        lambda: (errors(ours, exact, [image], True), errors(exact, exact, [image], True)),
-    )
+    work = Work(bytes=4 * 3 * 3)  # both images read, a gradient written
+    return of_function("loss with SSIM, 400 x 400 x 3", [image], ours, exact, work, unit="pixel", count=400 * 400)
 
 
 def _ray_generation(model: str, lens: list[float]) -> Kernel:

@@ -46,12 +46,7 @@ def published(folder: Path) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Write the report's plot of time against error to a file; report it if that fails.
-
-    Args:
-        rows: rows of the comparison's table.
-        path: file to write; its folder is created if missing.
-    """
+    """Write the report's plot of `rows` to the file `path`, in a folder that is made if missing, or report why not."""
     if not any(row.runs for row in rows):
         say("no plot of time against error: no method finished")
     elif not plots.available():

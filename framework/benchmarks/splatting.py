@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.benchmarks.ceilings import Work
-from nerfloom.benchmarks.compared import Errors, Kernel, errors
+from nerfloom.benchmarks.compared import Errors, Kernel, errors, of_function
 from nerfloom.benchmarks.timing import differentiated, once
 from nerfloom.kernels.splats.blend import Blended, blend, blend_reference, blended_pairs
 from nerfloom.kernels.splats.project import Record, SplatCamera, project_gaussians, project_reference
@@ -40,14 +40,8 @@ def splatting() -> Iterator[Kernel]:
         return project_reference(means, scales, turns, logits, colors, harmonics, camera, 15)[0]
 
     records = ours(*parameters)
-    yield Kernel(
-        "projection of Gaussians, degree 3",
-        "Gaussian",
-        COUNT,
-        (differentiated(ours, parameters, None), differentiated(exact, parameters, None)),
-        Work(bytes=4 * (14 + 45 + 16)),
-        lambda: (errors(ours, exact, parameters, True), errors(exact, exact, parameters, True)),
-    )
+    work = Work(bytes=4 * (14 + 45 + 16))
+    yield of_function("projection of Gaussians, degree 3", parameters, ours, exact, work, unit="Gaussian")
     yield _listing(records)
     yield _blending(records)
 

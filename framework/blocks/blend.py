@@ -53,14 +53,10 @@ def visible_shares(shares: Tensor, visibilities: Tensor) -> Tensor:
 
 
 def blended(pictures: Sequence[Picture], shares: Sequence[float]) -> Picture:
-    """Return one picture of several of the same size.
+    """Return one picture of several `pictures`, of one size and unit of depth, by their `shares`, which sum to 1.
 
     Colour and opacity are means weighted by the shares. The depth is a mean weighted by share and opacity, and the
     median depth comes from the picture with the largest share, since a mean of two surfaces is none.
-
-    Args:
-        pictures: at least one picture; all depths in the same unit.
-        shares: the share of each, which sum to 1.
     """
     first = pictures[0].accumulation
     weights = torch.tensor(shares, dtype=first.dtype, device=first.device)[:, None, None]

@@ -44,24 +44,16 @@ def fitted_color(seen: Tensor, wanted: Tensor, ridge: float = RIDGE) -> Tensor:
 
 
 def recolored(picture: Picture, color: Affine, background: Tensor) -> Picture:
-    """Return a picture in other colours. The background keeps its own.
-
-    Args:
-        picture: the picture.
-        color: the affine function of colours.
-        background: (3,) the colour that it was rendered over.
-    """
+    """Return a `picture` in the colours of a function `color`. Its `background` (3,) keeps its own."""
     matrix = torch.tensor(color, dtype=picture.rgb.dtype, device=picture.rgb.device)
     seen = without_background(picture.rgb, picture.accumulation, background)
     return replace(picture, rgb=picture.rgb + transformed(seen, matrix) - seen[..., :3])
 
 
 def recolored_gaussians(gaussians: Gaussians, color: Affine) -> Gaussians:
-    """Return Gaussians in other colours. Their harmonics are linear in colour, so this is exact before clamping.
+    """Return N `gaussians` in the colours of a function `color`.
 
-    Args:
-        gaussians: N Gaussians.
-        color: the affine function of colours.
+    Their harmonics are linear in colour, so this is exact before clamping.
     """
     matrix = torch.tensor(color, dtype=torch.float64, device=gaussians.means.device)
     turned, shift = matrix[:, :3], matrix[:, 3]
@@ -78,10 +70,7 @@ def matching_order(cameras: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
 
     The first block is the one that shares most images with others; each next pair shares the most images that any pair
     can (Prim's algorithm for a largest spanning tree). A block that shares none with those before starts anew, and is
-    in no pair.
-
-    Args:
-        cameras: indices of the images of each block.
+    in no pair. `cameras` has the indices of the images of each block.
     """
     shared = _shared_images(cameras)
     pairs, done = list[tuple[int, int]](), set[int]()

@@ -102,12 +102,7 @@ class Blocks(Renderable):
         return blended(pictures, list(shares.values()))
 
     def shares(self, view: View, background: Tensor) -> dict[int, float]:
-        """Return the share in a picture of each block that it shows, by its number; they sum to 1.
-
-        Args:
-            view: the camera, in the composed scene.
-            background: (3,) colour of the background.
-        """
+        """Return the share of each block in a picture of `view` over a `background` (3,), by number; they sum to 1."""
         position = self.placement.original_points(view.camera.camera_to_worlds[:, :, 3].cpu())
         shares = near_shares((self._centers - position).norm(dim=-1), self._radii)
         near = _worth_drawing(shares)
@@ -129,12 +124,11 @@ class Blocks(Renderable):
         return [float(network.of(points, directions).mean()) for network in networks]
 
     def picture_of(self, number: int, view: View, background: Tensor) -> Picture:
-        """Return the picture of one block in its own colours, with lengths in units of the composed scene.
+        """Return the picture of a `view` over a `background` (3,) by the block with a `number`.
 
-        Args:
-            number: index of the block.
-            view: the camera, in the composed scene.
-            background: (3,) colour of the background.
+        Colours are the block's own, and lengths are in units of the composed scene.
+
+        Colours are the block's own, and lengths are in units of the composed scene.
         """
         model, placement = self.opened(number)
         rotation, scale, shift = self.placement.similarity_to(placement)

@@ -58,11 +58,7 @@ def is_blocks_file(path: Path) -> bool:
 
 
 def write_blocks(file: Path, content: BlockList) -> None:
-    """Write the file of a scene in blocks.
-
-    Args:
-        file: path of the file. Runs below its folder are named relative to it.
-        content: the scene and its blocks.
+    """Write a `file` of a scene in blocks, `content`. Runs below the file's folder are named relative to it.
 
     Raises:
         OSError: if the file cannot be written.
@@ -93,10 +89,7 @@ def _relative(run: Path, folder: Path) -> str:
 
 
 def read_blocks(file: Path) -> BlockList:
-    """Read the file of a scene in blocks.
-
-    Args:
-        file: the file.
+    """Read the `file` of a scene in blocks.
 
     Raises:
         ConfigError: if the file is missing or is not YAML.

@@ -31,25 +31,18 @@ def merged(parts: Sequence[Gaussians], centers: Tensor) -> Gaussians:
 
 
 def of_cell(part: Gaussians, centers: Tensor, number: int) -> Gaussians:
-    """Return the Gaussians of a block that it keeps in `merged`, without columns that a method added.
+    """Return the Gaussians `part` of the block `number` that it keeps in `merged`, without columns that a method added.
 
-    Args:
-        part: the Gaussians of the block.
-        centers: (B, 3) centres of all blocks in the same frame.
-        number: index of the block.
+    `centers` (B, 3) are those of all blocks, in the same frame.
+
+    `centers` (B, 3) are those of all blocks, in the same frame.
     """
     own = part[in_cell(part.means, centers, number)]
     return Gaussians.of({name: getattr(own, name) for name in COLUMNS})
 
 
 def in_cell(points: Tensor, centers: Tensor, number: int) -> Tensor:
-    """Return (N,) bool, which points are in the Voronoi cell of a centre.
-
-    Args:
-        points: (N, 3) positions.
-        centers: (B, 3) centres.
-        number: index of the centre.
-    """
+    """Return (N,) bool, which of `points` (N, 3) are in the Voronoi cell of the centre `number` of `centers` (B, 3)."""
     points = points.double()
     nearest = torch.full_like(points[:, 0], torch.inf)
     cell = torch.zeros(len(points), dtype=torch.int64, device=points.device)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from nerfloom.base.archives import uncompressed_size
 from nerfloom.base.atomic import write_atomically
-from nerfloom.base.errors import DataError
+from nerfloom.base.errors import DataError, one_line
 from nerfloom.blocks.block import Vector
 from nerfloom.cameras.poses import Placement
 from nerfloom.cameras.view import View
@@ -101,11 +101,7 @@ def points_in_view(view: View, placement: Placement, reach: float) -> tuple[Tens
 
 
 def write_visibility(file: Path, network: Visibility) -> None:
-    """Write a network to a file.
-
-    Args:
-        file: path of the file.
-        network: the network.
+    """Write a `network` to a `file`.
 
     Raises:
         OSError: if the file cannot be written.
@@ -116,10 +112,7 @@ def write_visibility(file: Path, network: Visibility) -> None:
 
 
 def read_visibility(file: Path) -> Visibility:
-    """Read a network from a file.
-
-    Args:
-        file: the file.
+    """Read a network from a `file`.
 
     Raises:
         DataError: if it cannot be read, or is damaged.
@@ -132,8 +125,7 @@ def read_visibility(file: Path) -> Visibility:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or error}") from error
     except Exception as error:  # numpy, zipfile and zlib raise ValueError, EOFError, BadZipFile, zlib.error and more
-        because = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DataError(f"{file} is damaged: {because}; remove it, and run ns-blocks again") from error
+        raise DataError(f"{file} is damaged: {one_line(error)}; remove it, and run ns-blocks again") from error
 
 
 def _network(arrays: dict[str, np.ndarray]) -> Visibility:

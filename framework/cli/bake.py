@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerfloom.base.errors import FlagError
-from nerfloom.cli.common import make_room, run_command, with_run
+from nerfloom.cli.common import entry_point, make_room, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.run_flags import RunFlags
 
@@ -37,12 +37,9 @@ class BakeFlags(RunFlags):
     """Time to learn from the photographs; 0: none."""
 
 
-def main() -> None:
-    """Run ns-bake on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-bake on the `arguments` of the process."""
     flags = read_flags(BakeFlags, "ns-bake", with_run(arguments), takes="RUN_FOLDER")
     _check(flags)
     found = flags.check()

@@ -13,7 +13,7 @@ from nerfloom.base.errors import ConfigError, FlagError, nearest
 from nerfloom.cli.bench_flags import FramesFlags, KernelFlags, MethodFlags, ProfileFlags
 from nerfloom.cli.bench_gpu import GpuFlags, measure_gpu
 from nerfloom.cli.bench_results import run_benchmark, write_results
-from nerfloom.cli.common import make_room, run_command
+from nerfloom.cli.common import entry_point, make_room
 from nerfloom.training.run_path import data_name
 
 USAGE = """\
@@ -30,12 +30,9 @@ ns-bench WHAT --help shows its flags. Results are written as JSON to docs/result
 """
 
 
-def main() -> None:
-    """Run ns-bench on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-bench on the `arguments` of the process."""
     run_benchmark("ns-bench", arguments, KINDS, USAGE)
 
 
@@ -81,13 +78,12 @@ def _profile(flags: ProfileFlags) -> None:
     from nerfloom.benchmarks.profile_step import measure
     from nerfloom.benchmarks.results import add_row
     from nerfloom.cli.train import run_of
-    from nerfloom.comparison.plan import split_words
+    from nerfloom.comparison.plan import split_method
 
-    if not (words := split_words(flags.method, "--method")):
-        raise FlagError("--method is empty; give the name of a method, such as instant-ngp")
+    method, own = split_method(flags.method, "--method")
     path = flags.output_dir / "profile-step.json"
     make_room(path)
-    run = run_of(words[0], [*words[1:], "--data", str(flags.data)])
+    run = run_of(method, [*own, "--data", str(flags.data)])
     add_row(path, flags.method, measure(run, flags.steps, flags.max_seconds))
 
 

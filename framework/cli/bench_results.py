@@ -25,9 +25,7 @@ def run_benchmark(
 
     `command` and `usage` are for the help.
     """
-    if (chosen := chosen_kind(arguments, kinds, usage, "there is no benchmark")) is None:
-        return
-    name, (flags, run), rest = chosen
+    name, (flags, run), rest = chosen_kind(arguments, kinds, usage, "there is no benchmark")
     settings: Any = read_flags(flags, f"{command} {name}", rest)
     if getattr(settings, "data", None) is not None:
         check_data(settings.data)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.cli.common import run_command
+from nerfloom.cli.common import entry_point
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.job_flags import JobFlags
 from nerfloom.training.run_path import check_data, check_writable, data_name
@@ -78,12 +78,9 @@ class BlocksFlags(JobFlags):
         return flags
 
 
-def main() -> None:
-    """Run ns-blocks on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-blocks on the `arguments` of the process."""
     flags = read_flags(BlocksFlags, "ns-blocks", arguments)
     flags.check()
     if flags.data is not None:
@@ -92,16 +89,14 @@ def _command(arguments: list[str]) -> None:
     folder = (flags.output_dir or Path("outputs") / f"blocks-{name}").absolute()
     check_writable(folder, "the runs to")
     from nerfloom.cli.train import run_of
-    from nerfloom.comparison.plan import split_words
+    from nerfloom.comparison.plan import split_method, split_words
 
-    words = split_words(flags.method, "--method")
-    if not words:
-        raise FlagError("--method is empty; name a method, such as nerfacto")
-    shared = [*words[1:], *flags.budget()]
+    method, own = split_method(flags.method, "--method")
+    shared = [*own, *flags.budget()]
     if flags.data is not None:
         shared += ["--data", str(flags.data.absolute())]
     shared += split_words(flags.data_flags, "--data-flags")
-    build(flags, run_of(words[0], shared), tuple(shared), folder)
+    build(flags, run_of(method, shared), tuple(shared), folder)
 
 
 def build(flags: BlocksFlags, run: Run, shared: tuple[str, ...], folder: Path) -> None:

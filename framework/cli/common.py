@@ -7,6 +7,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Collection, Mapping
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,10 +25,8 @@ if TYPE_CHECKING:
 K = TypeVar("K")
 
 
-def chosen_kind(
-    arguments: list[str], kinds: Mapping[str, K], usage: str, unknown: str
-) -> tuple[str, K, list[str]] | None:
-    """Look up the first argument, or print the help if it asks for help.
+def chosen_kind(arguments: list[str], kinds: Mapping[str, K], usage: str, unknown: str) -> tuple[str, K, list[str]]:
+    """Look up the first argument, or print the help if there is none or it asks for help.
 
     Args:
         arguments: arguments of the command.
@@ -36,14 +35,15 @@ def chosen_kind(
         unknown: start of the message for an unknown name, such as "unknown path".
 
     Returns:
-        The name, its entry of `kinds` and the remaining arguments; None if the help was printed.
+        The name, its entry of `kinds` and the remaining arguments.
 
     Raises:
         ConfigError: if `kinds` has no such name; the message suggests the nearest.
+        SystemExit: with status 0 after the help.
     """
     if not arguments or arguments[0] in HELP:
         print(usage)
-        return None
+        sys.exit(0)
     name = arguments[0]
     if name in KINDS and name not in kinds:
         raise ConfigError(f"'{name}' is nerfstudio's; {KINDS[name]}")
@@ -53,12 +53,7 @@ def chosen_kind(
 
 
 def refuse_foreign(arguments: list[str], answers: Mapping[str, str], command: str) -> None:
-    """Refuse the flags of nerfstudio's `command` that do not exist here.
-
-    Args:
-        arguments: arguments of the command.
-        answers: a table of `from_nerfstudio`: what to use here.
-        command: name of the command.
+    """Refuse flags of nerfstudio's `command` in `arguments` that are not here, with `answers` of `from_nerfstudio`.
 
     Raises:
         FlagError: with the answer to the first such flag.
@@ -132,11 +127,7 @@ def with_format(command: str, arguments: list[str]) -> tuple[list[str], tuple[st
 
 
 def take(arguments: list[str], flag: str) -> tuple[str | None, list[str]]:
-    """Take a flag and its value out of the arguments of a command.
-
-    Args:
-        arguments: arguments of the command.
-        flag: the flag; its value is the next argument, or follows a "=".
+    """Take a `flag` and its value, the next word or the rest after a "=", out of the `arguments` of a command.
 
     Returns:
         The value, None if the flag is not given, and the other arguments.
@@ -184,15 +175,17 @@ def check_weights(path: Path | None) -> None:
         read_weights(path)
 
 
+def entry_point(command: Callable[[list[str]], None]) -> Callable[[], None]:
+    """Return the entry point of a `command`, a function of its arguments, as `run_command` runs it."""
+    return wraps(command)(lambda: run_command(command))
+
+
 def run_command(command: Callable[[list[str]], None]) -> None:
-    """Run a command on the arguments of the process, and exit with its status.
+    """Run a `command` on the arguments of the process, without `--debug`, and exit with its status.
 
     Errors that a user can act on are printed on one line; the exit status is 1, or 2 for an error in the flags. The
     argument `--debug` shows the traceback. After a signal the status is 128 plus the signal's number. `--version`
     prints the version, and with `--environment` also the details for error reports.
-
-    Args:
-        command: function of the list of arguments, without `--debug`.
     """
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.cli.common import check_weights, run_command, take
+from nerfloom.cli.common import check_weights, entry_point, take
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.geometry_flags import GeometryFlags
 from nerfloom.cli.job_flags import JobFlags
@@ -47,12 +47,9 @@ class CompareFlags(JobFlags, GeometryFlags):
     """Number of views in evaluations during training; 0: none."""
 
 
-def main() -> None:
-    """Run ns-compare on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-compare on the `arguments` of the process."""
     from nerfloom.base.plain import from_plain, read_yaml
 
     recipe, arguments = take(arguments, "--load-config")

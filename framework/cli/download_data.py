@@ -8,7 +8,7 @@ from pathlib import Path
 
 from nerfloom.base.errors import FlagError
 from nerfloom.base.signals import Stopped, signal_of
-from nerfloom.cli.common import chosen_kind, run_command
+from nerfloom.cli.common import chosen_kind, entry_point
 from nerfloom.cli.flags import read_flags
 from nerfloom.downloads.catalogue import DATASETS
 
@@ -37,15 +37,10 @@ class DownloadFlags:
     """Keep the archives after unpacking, in the folder .downloads of the save-dir."""
 
 
-def main() -> None:
-    """Run ns-download-data on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
-    if (chosen := chosen_kind(arguments, DATASETS, _usage(), "unknown data set")) is None:
-        return
-    name, dataset, rest = chosen
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-download-data on the `arguments` of the process."""
+    name, dataset, rest = chosen_kind(arguments, DATASETS, _usage(), "unknown data set")
     if any(word.partition("=")[0].replace("_", "-") == "--capture-name" for word in rest):
         raise FlagError("--capture-name is nerfstudio's; here it is --scenes")
     description = f"{dataset.title}\nscenes: {', '.join(dataset.scenes)}\nlicence: {dataset.licence}"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.cli.common import make_room, run_command, with_format, with_run
+from nerfloom.cli.common import entry_point, make_room, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.region_flags import RegionFlags
 from nerfloom.cli.run_flags import OPENS, OpenFlags
@@ -102,12 +102,9 @@ class EditFlags(RegionFlags, OpenFlags):
             raise FlagError(str(error)) from error
 
 
-def main() -> None:
-    """Run ns-edit on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-edit on the `arguments` of the process."""
     words, named = with_format("ns-edit", with_run(arguments))
     flags = read_flags(EditFlags, "ns-edit", words, takes=OPENS)
     _check(flags)

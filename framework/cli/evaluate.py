@@ -9,7 +9,7 @@ from typing import Literal
 from nerfloom.base.config import HeldOutAppearance, RaysPerPixel
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
 from nerfloom.blocks.files import is_blocks_file
-from nerfloom.cli.common import make_room, run_command, with_format, with_run
+from nerfloom.cli.common import entry_point, make_room, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.geometry_flags import GeometryFlags
 from nerfloom.cli.run_flags import OPENS, RunFlags
@@ -48,12 +48,9 @@ class EvalFlags(GeometryFlags, RunFlags):
     """Existing mesh (.ply, .obj, .glb) to compare with the reference instead of one made by --surface."""
 
 
-def main() -> None:
-    """Run ns-eval on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-eval on the `arguments` of the process."""
     words, named = with_format("ns-eval", with_run(arguments, ("--f-score-at",)))
     flags = read_flags(EvalFlags, "ns-eval", words, takes=OPENS)
     if flags.max_images is not None and flags.max_images < 1:

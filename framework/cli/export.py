@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from nerfloom.base.from_nerfstudio import EXPORTING
-from nerfloom.cli.common import chosen_kind, make_room, refuse_foreign, run_command, with_format, with_run
+from nerfloom.cli.common import chosen_kind, entry_point, make_room, refuse_foreign, with_format, with_run
 from nerfloom.cli.export_flags import (
     CameraFlags,
     LevelsFlags,
@@ -44,15 +44,10 @@ has set. In .glb files, y is up.
 """
 
 
-def main() -> None:
-    """Run ns-export on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
-    if (chosen := chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")) is None:
-        return
-    name, (kind, file), rest = chosen
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-export on the `arguments` of the process."""
+    name, (kind, file), rest = chosen_kind(arguments, KINDS, USAGE, "nothing is exported as")
     refuse_foreign(rest, EXPORTING, "ns-export")
     words, named = with_format(f"ns-export {name}", with_run(rest))
     flags = read_flags(kind, f"ns-export {name}", words, takes=OPENS)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.base.extras import install_command
+from nerfloom.base.extras import require
 
 FILES = ("reference_mesh", "reference_points")
 """Settings that are files."""
@@ -61,8 +61,7 @@ class GeometryFlags:
             return
         if not self.reference.is_file():
             raise ConfigError(f"{self.reference} is not a file; give the mesh or the points of the true surface")
-        if (advice := install_command("export")) is not None:
-            raise ConfigError(f"judging a surface needs packages that are not installed: {advice}")
+        require("export", "judging a surface needs")
 
     def words(self) -> tuple[str, ...]:
         """Return the flags that differ from their defaults, with absolute paths, for another command."""

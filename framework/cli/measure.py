@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.cli.common import run_command, with_format, with_run
+from nerfloom.cli.common import entry_point, with_format, with_run
 from nerfloom.cli.flags import numbers_in, read_flags
 from nerfloom.cli.run_flags import OPENS, RunFlags
 
@@ -34,12 +34,9 @@ class MeasureFlags(RunFlags):
     """Remove the scale, so that lengths are in the unit of the input again."""
 
 
-def main() -> None:
-    """Run ns-measure on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-measure on the `arguments` of the process."""
     words, named = with_format("ns-measure", with_run(arguments, ("--between", "--scale-points")))
     flags = read_flags(MeasureFlags, "ns-measure", words, takes=OPENS)
     given = [flags.between, flags.scale_points, flags.forget_scale or None]

@@ -10,7 +10,7 @@ from pathlib import Path
 from string import Template
 
 from nerfloom.base.errors import ConfigError
-from nerfloom.cli.common import run_command
+from nerfloom.cli.common import entry_point
 from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
 
@@ -33,12 +33,9 @@ class NewMethodFlags:
     """Folder to write, new or empty. Default: the method's name."""
 
 
-def main() -> None:
-    """Run ns-new-method on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-new-method on the `arguments` of the process."""
     if not arguments or set(HELP) & set(arguments):
         print(USAGE)
         return

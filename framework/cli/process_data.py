@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import get_type_hints
 
-from nerfloom.cli.common import chosen_kind, run_command
+from nerfloom.cli.common import chosen_kind, entry_point
 from nerfloom.cli.flags import read_flags
 from nerfloom.processing.kinds import KINDS, process
 from nerfloom.processing.settings import OutputFlags
@@ -30,15 +30,10 @@ ns-process-data KIND --help shows its flags.
 """
 
 
-def main() -> None:
-    """Run ns-process-data on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
-    if (chosen := chosen_kind(arguments, KINDS, USAGE, "unknown kind")) is None:
-        return
-    name, (kind, _), rest = chosen
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-process-data on the `arguments` of the process."""
+    name, (kind, _), rest = chosen_kind(arguments, KINDS, USAGE, "unknown kind")
     words = _spelt_out(rest, kind)
     if (other := _what_it_is(name, words)) is not None:
         name, words = other

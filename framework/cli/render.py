@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfloom.base.from_nerfstudio import RENDERING
-from nerfloom.cli.common import chosen_kind, make_room, refuse_foreign, run_command, with_format, with_run
+from nerfloom.cli.common import chosen_kind, entry_point, make_room, refuse_foreign, with_format, with_run
 from nerfloom.cli.flags import read_flags
 from nerfloom.cli.render_flags import FLAGS, USAGE
 from nerfloom.cli.run_flags import OPENS
@@ -16,17 +16,12 @@ if TYPE_CHECKING:
     from nerfloom.training.file_data import DataFormat
 
 
-def main() -> None:
-    """Run ns-render on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
-    if (chosen := chosen_kind(arguments, FLAGS, USAGE, "unknown path")) is None:
-        return
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-render on the `arguments` of the process."""
     import tyro
 
-    name, path, rest = chosen
+    name, path, rest = chosen_kind(arguments, FLAGS, USAGE, "unknown path")
     refuse_foreign(rest, RENDERING, "ns-render")
     words, named = with_format(f"ns-render {name}", with_run(rest, {"--rendered-output-names"}))
     options = (tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes)

@@ -7,14 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfloom.cli.run_flags import RunFlags
-from nerfloom.video.settings import (
-    CameraPathSettings,
-    DatasetSettings,
-    InterpolateSettings,
-    OrbitSettings,
-    SpiralSettings,
-    TimeSettings,
-)
+from nerfloom.video.settings import PATHS, PathSettings
 
 USAGE = """\
 usage: ns-render PATH RUN_FOLDER --output-path FILE_OR_FOLDER [flags]
@@ -51,45 +44,12 @@ class RenderFlags:
     PATH.mp4, or PATH.gif without the extra [video]; of dataset: renders."""
 
 
-@dataclass(frozen=True)
-class CameraPathFlags(CameraPathSettings, RenderFlags):
-    """Render the cameras of a file, camera_path.json, in the format of nerfstudio's viewer."""
+def flags_of(settings: type[PathSettings]) -> type[Any]:
+    """Return the class of the flags of a path with `settings`; the settings' docstring is the help."""
+    about = settings.__doc__ or ""
+    members = {"__doc__": f"Render {about[:1].lower()}{about[1:]}", "__module__": __name__}
+    return dataclass(frozen=True)(type("Flags", (settings, RenderFlags), members))
 
 
-@dataclass(frozen=True)
-class InterpolateFlags(InterpolateSettings, RenderFlags):
-    """Render a smooth walk past the training cameras, along a short tour that passes each of them once."""
-
-
-@dataclass(frozen=True)
-class SpiralFlags(SpiralSettings, RenderFlags):
-    """Render a spiral around the mean camera, for cameras that look the same way (LLFF's path)."""
-
-
-@dataclass(frozen=True)
-class OrbitFlags(OrbitSettings, RenderFlags):
-    """Render a horizontal circle around the scene, with the mean height and distance of the training cameras.
-
-    If the photographs of a capture leave out a sixth of the circle or more, the path swings over their part and back.
-    """
-
-
-@dataclass(frozen=True)
-class TimeFlags(TimeSettings, RenderFlags):
-    """Render the view of one camera while time runs from 0 to 1; a PNG file shows the frames side by side."""
-
-
-@dataclass(frozen=True)
-class DatasetFlags(DatasetSettings, RenderFlags):
-    """Render each camera of a split to a folder, OUTPUT_PATH/SPLIT/OUTPUT/IMAGE.png, or to a video."""
-
-
-FLAGS: dict[str, type[Any]] = {
-    "camera-path": CameraPathFlags,
-    "interpolate": InterpolateFlags,
-    "spiral": SpiralFlags,
-    "orbit": OrbitFlags,
-    "time": TimeFlags,
-    "dataset": DatasetFlags,
-}
+FLAGS: dict[str, type[Any]] = {name: flags_of(settings) for name, settings in PATHS.items()}
 """Name of a path -> its flags."""

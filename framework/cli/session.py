@@ -13,8 +13,8 @@ import torch
 
 from nerfloom.base.console import say
 from nerfloom.base.device import choose_device, peak_memory
-from nerfloom.base.errors import ConfigError, LostProcessError
-from nerfloom.base.extras import install_command
+from nerfloom.base.errors import LostProcessError
+from nerfloom.base.extras import require
 from nerfloom.base.processes import from_first, joined_processes, processes
 from nerfloom.base.signals import Stopped, handled, signal_of
 from nerfloom.cli.common import check_weights
@@ -90,8 +90,8 @@ def resume(run: Run) -> None:
 
 
 def _prepare(run: Run) -> Trainer:
-    if "viewer" in run.config.vis and (command := install_command("viewer")) is not None:
-        raise ConfigError(f"--vis {run.config.vis} needs viser: {command}")
+    if "viewer" in run.config.vis:
+        require("viewer", f"--vis {run.config.vis} needs")
     check_weights(run.config.lpips_weights)
     device = choose_device(run.config.machine)
     train_set, images = on_device(load_split(run, "train"), device)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from nerfloom.base.errors import ConfigError, FlagError, NerfloomError
 from nerfloom.base.json_files import write_json
-from nerfloom.cli.common import make_room, run_command
+from nerfloom.cli.common import entry_point, make_room
 from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import registered
 from nerfloom.training.run_path import check_data
@@ -60,12 +60,9 @@ class StressFlags:
     """JSON file to write, with a .md beside it. Default: outputs/stress-DATA/METHOD.json, or methods.json."""
 
 
-def main() -> None:
-    """Run ns-stress on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-stress on the `arguments` of the process."""
     if not arguments or arguments[0] in HELP:
         print(USAGE)
         return
@@ -129,13 +126,11 @@ def stress(methods: Sequence[str], flags: StressFlags) -> list[Result]:
 def _run(method: str, flags: StressFlags) -> Run:
     """Return the run that `ns-train` would start with the method and its flags."""
     from nerfloom.cli.train import run_of
-    from nerfloom.comparison.plan import split_words
+    from nerfloom.comparison.plan import split_method, split_words
 
-    words, data_flags = split_words(method, "METHOD"), split_words(flags.data_flags, "--data-flags")
-    if not words:
-        raise ConfigError("the method is missing, as in 'ns-stress instant-ngp'")
+    name, own = split_method(method, "METHOD")
     data = [] if flags.data is None else ["--data", str(flags.data)]
-    run = run_of(words[0], [*words[1:], *data, *data_flags])
+    run = run_of(name, [*own, *data, *split_words(flags.data_flags, "--data-flags")])
     if run.config.data != flags.data:
         raise ConfigError(f"{method}: put --data after the methods; all methods use the same photographs")
     return run

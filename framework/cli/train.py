@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.from_nerfstudio import flag_answer, taken, vis_answer
-from nerfloom.cli.common import run_command, take
+from nerfloom.cli.common import entry_point, take
 from nerfloom.cli.flags import HELP, read_flags
 from nerfloom.registry import entry_of, registered, summary
 
@@ -30,12 +30,9 @@ usage: ns-train METHOD [--data DIR] [flags] [FORMAT [format flags]]
 """
 
 
-def main() -> None:
-    """Run ns-train on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-train on the `arguments` of the process."""
     if not arguments or arguments[0] in HELP:
         print(_overview())
         return

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nerfloom.base.errors import FlagError
 from nerfloom.base.machine_config import ViewerConfig
-from nerfloom.cli.common import run_command, with_format, with_run
+from nerfloom.cli.common import entry_point, with_format, with_run
 from nerfloom.cli.flags import read_flags, words_of
 from nerfloom.cli.run_flags import OPENS, RunFlags
 from nerfloom.training.run_path import trained_run
@@ -29,12 +29,9 @@ class ViewerFlags(RunFlags):
     """Port to listen on, or the next free one."""
 
 
-def main() -> None:
-    """Run ns-viewer on the arguments of the process."""
-    run_command(_command)
-
-
-def _command(arguments: list[str]) -> None:
+@entry_point
+def main(arguments: list[str]) -> None:
+    """Run ns-viewer on the `arguments` of the process."""
     words, named = with_format("ns-viewer", with_run([_without_prefix(word) for word in arguments]))
     words = with_run(words, flag="--beside")
     flags = read_flags(ViewerFlags, "ns-viewer", words, takes=f"{OPENS} [{OPENS}]")

@@ -171,12 +171,9 @@ def read_json(path: Path) -> Any:
 
 
 def whole_levels(curve: Curve) -> dict[int, float]:
-    """Return the time when a curve first reached each integer PSNR, interpolated linearly between its points.
+    """Return the time when a `curve` first reached each integer PSNR, interpolated linearly between its points.
 
     The level of the first point counts as reached there, because nothing was measured earlier.
-
-    Args:
-        curve: the learning curve.
 
     Returns:
         Integer PSNR, dB -> seconds.

@@ -38,6 +38,17 @@ def split_words(text: str, flag: str) -> tuple[str, ...]:
         raise ConfigError(f"{flag}: {shown(text)} is invalid: {error}") from error
 
 
+def split_method(text: str, flag: str) -> tuple[str, tuple[str, ...]]:
+    """Split the value `text` of a `flag` into the name of a method and the method's flags.
+
+    Raises:
+        ConfigError: if it is empty, or a quote is not closed.
+    """
+    if not (words := split_words(text, flag)):
+        raise FlagError(f"{flag}: {shown(text)} names no method; give one, such as instant-ngp")
+    return words[0], words[1:]
+
+
 @dataclass(frozen=True)
 class Contender:
     """A method with its own flags.
@@ -59,11 +70,9 @@ class Contender:
         Raises:
             ConfigError: for an unknown method, or a quote that is not closed.
         """
-        words = split_words(text, "--methods")
-        if not words:
-            raise FlagError("--methods holds an empty name")
-        entry_of("methods", words[0])
-        return cls(" ".join(text.split()), words[0], words[1:])
+        method, flags = split_method(text, "--methods")
+        entry_of("methods", method)
+        return cls(" ".join(text.split()), method, flags)
 
     @property
     def slug(self) -> str:

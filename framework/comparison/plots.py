@@ -6,6 +6,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
+from nerfloom.base.extras import install_command
 from nerfloom.comparison.measures import Row, pareto
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#7f7f7f")
@@ -16,11 +17,7 @@ MISSING = "without plots: pip install matplotlib"
 
 def available() -> bool:
     """Return whether matplotlib is installed."""
-    try:
-        import matplotlib as matplotlib
-    except ImportError:
-        return False
-    return True
+    return install_command("plots") is None
 
 
 def color_of(index: int) -> str:
@@ -29,19 +26,15 @@ def color_of(index: int) -> str:
 
 
 def time_against_error(rows: Sequence[Row]) -> str:
-    """Plot PSNR against training seconds, and against rendering seconds per image, each with the Pareto front.
+    """Plot PSNR of `rows` against training seconds, and against rendering seconds per image, with the Pareto fronts.
 
     Curves use the views evaluated during training; final points, with a bar of one standard deviation, use all views.
-
-    Args:
-        rows: results of the contenders.
 
     Returns:
         The plot as an SVG element.
     """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = Figure(figsize=(11, 4.2), layout="constrained")
     FigureCanvasSVG(figure)
@@ -57,16 +50,23 @@ def time_against_error(rows: Sequence[Row]) -> str:
             axes.errorbar([cost], [psnr], [spread or 0], color=color, marker="o", markersize=6, label=row.label)
     for axes, name in ((training, "seconds"), (rendering, "render_seconds")):
         _front(axes, [(row.mean(name) or 0.0, row.mean("psnr") or 0.0) for _, row in finished])
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.grid(True, which="both", linewidth=0.3, alpha=0.6)
-    training.set_xlabel("training, s")
-    rendering.set_xlabel("rendering, s per image")
+    over_seconds(training, "training, s")
+    over_seconds(rendering, "rendering, s per image")
     training.set_ylabel("PSNR, dB")
     rendering.legend(fontsize="small", loc="best")
     return as_svg(figure)
+
+
+def over_seconds(axes: Any, label: str) -> None:
+    """Give `axes` of matplotlib a logarithmic x-axis with a `label`, with ticks at 1, 2 and 5, and a grid."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(True, which="both", linewidth=0.3, alpha=0.6)
+    axes.set_xlabel(label)
 
 
 def as_svg(figure: Any) -> str:

@@ -184,12 +184,9 @@ def measured(rows: Sequence[Row]) -> list[Column]:
 
 
 def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the rows of the table of results: label, colour, Pareto flag, and a cell for each column.
+    """Return the table of results of `rows`: for each its label, colour, Pareto flag, and a cell for each column.
 
     A row without results has no cells, and a word instead.
-
-    Args:
-        rows: results of the contenders.
     """
     finished = [row for row in rows if row.runs]
     front = pareto([(row.mean("seconds") or math.inf, row.mean("psnr") or 0.0) for row in finished])

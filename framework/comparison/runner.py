@@ -12,11 +12,7 @@ from nerfloom.jobs.launcher import Launcher
 
 
 def run_all(plan: Plan, launcher: Launcher) -> dict[PlannedRun, Failure]:
-    """Train and evaluate every unfinished run of a comparison.
-
-    Args:
-        plan: the comparison.
-        launcher: runs them.
+    """Train and evaluate every unfinished run of a `plan` by a `launcher`.
 
     Returns:
         The failed runs.

@@ -31,7 +31,6 @@ class HashGridConfig(TrainConfig):
         "max_resolution": (1, MAX_RESOLUTION),
         "log2_table_size": (1, MAX_LOG2_TABLE_SIZE),
     }
-    """Allowed ranges."""
     num_levels: int = 16
     """Number of levels of the hash grid."""
     features_per_level: int = 2

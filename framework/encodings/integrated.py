@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from nerfloom.geometry.bounds import contract_gaussians
+from nerfloom.data.scene import Scene
+from nerfloom.geometry.bounds import contract_gaussians, half_edge
 from nerfloom.geometry.points import Points
 
 
@@ -42,6 +43,16 @@ class IntegratedEncoding(nn.Module):
         self.register_buffer("directions", directions, persistent=False)
         self.num_frequencies, self.deviation, self.contracted = num_frequencies, deviation, contracted
         self.num_features = 2 * num_frequencies * (3 if directions is None else len(directions))
+
+    @classmethod
+    def of_images(
+        cls, scene: Scene, num_frequencies: int, contracted: bool, directions: Tensor | None = None
+    ) -> IntegratedEncoding:
+        """Return the encoding of a scene, where points without a size deviate by half a pixel or so.
+
+        `num_frequencies`, `contracted` and `directions` are as in the constructor.
+        """
+        return cls(scene.box, num_frequencies, half_edge(scene.box) / scene.image_size, contracted, directions)
 
     def forward(self, points: Points) -> Tensor:
         """Return the encoding (N, 2 K L) of `points`."""

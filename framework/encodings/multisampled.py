@@ -26,12 +26,7 @@ class MultisampledHashGrid(HashGrid):
     frustum stands for all, so that the others may have no gradient and look-ups can skip them.
 
     Args:
-        num_levels: number L of levels.
-        features_per_level: number F of features of an entry.
-        base_resolution: cells along an axis at the first level.
-        max_resolution: cells along an axis at the last level.
-        log2_table_size: maximum number of entries of one level, as a power of two.
-        sparse: whether the optimiser updates only the entries that a step has used, as in `HashGrid`.
+        num_levels, features_per_level, base_resolution, max_resolution, log2_table_size, sparse: as in `HashGrid`.
         decay: weight of the mean square of each level's features; its gradient is added in training mode.
 
     Raises:

@@ -20,9 +20,9 @@ from nerfloom.data.dataset import Dataset
 from nerfloom.data.pixels.batch import gather_batch
 from nerfloom.data.scene import Scene
 from nerfloom.fields.appearance import Appearance
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.losses.functions import mean_squared_error
 from nerfloom.renderable import Renderable, RendersRays, training_poses
-from nerfloom.samplers.proposal import half_edge
 
 STEPS, PIXELS = 30, 2048
 """Maximum number of steps of L-BFGS for fitting an appearance vector, and of pixels that it is fitted to."""
@@ -31,11 +31,7 @@ MAX_CANDIDATES = 32
 
 
 def right_half(image: Tensor) -> Tensor:
-    """Return the right half (H, W - W // 2, ...) of an image, used for metrics.
-
-    Args:
-        image: (H, W, ...) image.
-    """
+    """Return the right half (H, W - W // 2, ...) of an `image` (H, W, ...), used for metrics."""
     return image[:, image.shape[1] // 2 :]
 
 

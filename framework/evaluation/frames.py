@@ -180,10 +180,6 @@ def open_frames(output: Path, count: int, facts: dict[str, Any], part_length: in
     folder = together / key_of(facts)
     if others := [path for path in sorted(together.glob("*")) if path != folder]:
         say(f"{others[0]} has frames of another render (its run, cameras or flags differ); they are kept")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot write {folder}: {error.strerror or error}; use another path") from error
     write_file(folder / FACTS, (json.dumps(facts, indent=2) + "\n").encode())
     return Frames(folder, count, part_length)
 
@@ -214,7 +210,7 @@ def hash_of_tensors(*tensors: Tensor | None) -> str:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write `content` to the file `path` atomically.
+    """Write `content` to the file `path` atomically; its folder is created if missing.
 
     Raises:
         ConfigError: if it cannot be written.
@@ -223,8 +219,9 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def _write(path: Path, write: Callable[[BinaryIO], object], flush: bool = True) -> None:
-    """Call `write_atomically`, and convert errors of the system."""
+    """Create the folder of a file, call `write_atomically`, and convert errors of the system."""
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, write, flush)
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror or error}") from error
+        raise ConfigError(f"cannot write {path}: {error.strerror or error}; use another path") from error

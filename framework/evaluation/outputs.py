@@ -105,13 +105,9 @@ def _colors(output: Output, rgb: Tensor, truth: Tensor | None) -> np.ndarray:
 
 
 def distance_range(frames: Iterable[Arrays], name: str) -> tuple[float, float]:
-    """Return the range of distances for the colours of all frames, so that a colour means the same in each.
+    """Return the range of colours of an output `name`, a number, in all `frames`, so that they mean the same in each.
 
     It covers the 2nd to the 98th percentile of the opaque pixels of every frame; 0 and 1 if there are none.
-
-    Args:
-        frames: arrays of the frames.
-        name: name of the output, a distance or another number.
     """
     ends = [
         depth_range(torch.from_numpy(kept[name]), torch.from_numpy(kept["accumulation"] >= OPAQUE))

@@ -55,13 +55,9 @@ def view_panels(prediction: Tensor, target: Tensor, picture: Picture) -> list[Pa
 
 
 def as_colors(picture: Picture, output: Output) -> tuple[Tensor, tuple[str, str] | None]:
-    """Return an output of a picture as colours (H, W, 3), and the labels of its range, if it is a number.
+    """Return an `output` of a `picture` as colours (H, W, 3), and the labels of its range, if it is a number.
 
     Numbers are shown where opacity is above one half, over their 2nd to 98th percentile there.
-
-    Args:
-        picture: the rendered view.
-        output: one of its outputs.
     """
     values = output.pictured(picture.of(output.name)).float()
     if output.kind not in ("distance", "scalar"):

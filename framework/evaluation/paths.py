@@ -81,14 +81,10 @@ class Arc:
 
 
 def arc_of(cameras: Cameras, center: Tensor) -> Arc | None:
-    """Return the arc around a centre where cameras stand; None if they stand all around it.
+    """Return the arc around a `center` (3,) where M `cameras` stand; None if they stand all around it.
 
     They stand all around if no gap between neighbours exceeds `MAX_GAP`. Cameras almost above or below the centre are
     ignored.
-
-    Args:
-        cameras: M cameras.
-        center: (3,) centre, scene units.
     """
     offsets = _beside(cameras, center)
     if len(offsets) < MIN_CAMERAS:
@@ -203,13 +199,9 @@ class Walk:
 
 
 def shortest_order(cameras: Cameras, closed: bool = True) -> Tensor:
-    """Return the order (M,) int64 of a short tour past cameras, each once (`tour`).
+    """Return the order (M,) int64 of a short tour past M `cameras`, each once, and back if `closed` (`tour`).
 
     Distances and turns count: a turn by a radian equals the cameras' distance from their mean position.
-
-    Args:
-        cameras: M cameras.
-        closed: whether the tour returns to its first camera.
     """
     return tour(_stations(cameras.camera_to_worlds), closed)
 

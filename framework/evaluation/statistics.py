@@ -12,10 +12,7 @@ Rows = Sequence[dict[str, Any]]
 
 
 def statistics(rows: Rows) -> dict[str, Any]:
-    """Return the statistics of all images and, as `by_size`, of each image size if there are several.
-
-    Args:
-        rows: report on each image.
+    """Return the statistics of all images of `rows` and, as `by_size`, of each image size if there are several.
 
     Returns:
         For each metric its mean, standard deviation (`_std`) and, unless every image has it, number of images

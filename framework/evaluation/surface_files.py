@@ -19,13 +19,10 @@ SUFFIXES = (".ply", ".obj", ".glb")
 
 
 def read_mesh(file: Path) -> Surface:
-    """Read a mesh. Unusable vertices and faces are left out and counted.
+    """Read a mesh from a PLY, OBJ or GLB `file`. Unusable vertices and faces are left out and counted.
 
     Normals at vertices come from a PLY file. A GLB file's parts are placed by its scene and joined. Nothing else is
     read, such as materials or textures beside the file.
-
-    Args:
-        file: path of a PLY, OBJ or GLB file.
 
     Raises:
         DataError: if the file cannot be read or has no face with an area.

@@ -56,13 +56,9 @@ class Surface:
         return f"{len(self.faces):,} faces, {len(self.points):,} vertices"
 
     def at(self, faces: Tensor, weights: Tensor) -> Samples:
-        """Return points of a mesh, with normals.
+        """Return points of a mesh, with normals, on `faces` (N,) at barycentric `weights` (N, 3).
 
         The normals are interpolated from the vertices, where there are any; otherwise they belong to the faces.
-
-        Args:
-            faces: (N,) face of each point.
-            weights: (N, 3) barycentric weights.
         """
         assert self.faces is not None
         members = self.faces[faces]

@@ -165,7 +165,6 @@ def write_images(paths: Iterable[Path], pictures: Iterable[np.ndarray]) -> None:
         ConfigError: if a file cannot be written.
     """
     for path, picture in zip(paths, pictures, strict=True):
-        _make_folder(path.parent)
         write_file(path, _encoded(picture, path.suffix))
 
 
@@ -181,7 +180,6 @@ def write_distances(paths: Iterable[Path], distances: Iterable[np.ndarray], unit
         ConfigError: if a file cannot be written.
     """
     for path, values in zip(paths, distances, strict=True):
-        _make_folder(path.parent)
         if path.suffix == ".npy":
             content = io.BytesIO()
             np.save(content, values, allow_pickle=False)
@@ -189,13 +187,6 @@ def write_distances(paths: Iterable[Path], distances: Iterable[np.ndarray], unit
         else:
             steps = np.clip(np.round(values.astype(np.float64) / unit), 0, MAX_UINT16).astype(np.uint16)
             write_file(path, _encoded(np.where(values > 0, np.maximum(steps, 1), 0).astype(np.uint16), ".png"))
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot write {folder}: {error.strerror or error}") from error
 
 
 def _encoded(pixels: np.ndarray, suffix: str) -> bytes:

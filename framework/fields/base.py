@@ -130,7 +130,7 @@ class MLP(nn.Sequential):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the output (N, D_out) for `inputs`, parts (N, D_i) that are concatenated along their features."""
-        weights, biases = self._parameters_by_layer()
+        weights, biases = self.parameters_by_layer()
         return mlp(inputs, weights, self.activation, biases)
 
     def density(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -141,7 +141,7 @@ class MLP(nn.Sequential):
         Args:
             inputs: parts (N, D_i) that are concatenated along their features.
         """
-        return density_mlp(inputs, *self._parameters_by_layer())
+        return density_mlp(inputs, *self.parameters_by_layer())
 
     def first(self, *inputs: Tensor) -> Tensor:
         """Return the first output (N,) alone, without the activation function of the output.
@@ -149,11 +149,11 @@ class MLP(nn.Sequential):
         Args:
             inputs: parts (N, D_i) that are concatenated along their features.
         """
-        weights, biases = self._parameters_by_layer()
+        weights, biases = self.parameters_by_layer()
         last = None if biases is None else [*biases[:-1], biases[-1][:1]]
         return mlp(inputs, [*weights[:-1], weights[-1][:1]], "none", last)[:, 0]
 
-    def _parameters_by_layer(self) -> tuple[list[Tensor], list[Tensor] | None]:
+    def parameters_by_layer(self) -> tuple[list[Tensor], list[Tensor] | None]:
         """Return the weights of each layer, and the biases if there are any."""
         layers = [layer for layer in self if isinstance(layer, nn.Linear)]
         return [layer.weight for layer in layers], [layer.bias for layer in layers] if self.bias else None

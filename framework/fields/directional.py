@@ -54,7 +54,6 @@ class PredictedNormalsConfig(TrainConfig):
     """Weights of the penalties on predicted normals (`nerfloom.losses.normals`)."""
 
     RANGES: ClassVar[dict[str, Range]] = {"normal_loss_mult": AT_LEAST_0, "orientation_loss_mult": AT_LEAST_0}
-    """Allowed range of each numeric setting."""
     normal_loss_mult: float = 3e-3
     """Weight of the difference between predicted normals and the density's normals."""
     orientation_loss_mult: float = 0.1
@@ -103,11 +102,7 @@ class HasDensityNormals(Protocol):
     """A field that computes the normals of its density, and may predict normals that should equal them."""
 
     def density_normals(self, points: Points) -> Tensor:
-        """Return the outward unit normals (N, 3) of the density, with a gradient; 0 where its gradient is 0.
-
-        Args:
-            points: N points.
-        """
+        """Return the outward unit normals (N, 3) of the density, with a gradient; 0 where its own gradient is 0."""
 
 
 def predicted_normals(features: Tensor) -> Tensor:

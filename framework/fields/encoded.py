@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.encodings.hash_grid import HashGrid
@@ -86,7 +86,7 @@ class BoxField(Field):
             return None
         if grid.deferred is not None:
             grid.deferred.layout = grid.layout
-        weights = _weights(network)
+        weights, _ = network.parameters_by_layer()
         if weights[0].shape[1] != grid.num_features:  # the network has further inputs
             return None
         around = self.box if self.unbounded else None
@@ -97,10 +97,8 @@ class DensityField(BoxField):
     """A field of density without colour, for proposals: mip-NeRF 360 (Barron et al. 2022), section 3.
 
     Args:
-        box: (2, 3) corners of the box, scene units.
-        encoding: encoding of positions in [0, 1]^3, or of positions and times in [0, 1]^4.
+        box, encoding, unbounded: as in `BoxField`.
         width: features of the hidden layer.
-        unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
     """
 
     def __init__(
@@ -125,14 +123,12 @@ class EncodedField(BoxField):
     """A field with a density network on an encoding, and a colour network on its output and the viewing direction.
 
     Args:
-        box: (2, 3) corners of the box, scene units.
-        encoding: encoding of positions in [0, 1]^3, or of positions and times in [0, 1]^4.
+        box, encoding, unbounded: as in `BoxField`.
         width: features of a hidden layer (64 in the paper).
         num_features: features that the density network passes to the colour network, the first being the log-density
             (16 in the paper).
         direction_levels: bands of the spherical harmonics of the viewing direction (4 in the paper); 0 for colours that
             do not depend on the direction.
-        unbounded: whether the encoding covers all of space, contracted by `contract_to_unit`.
         appearance: the images' appearance vectors, an input of the colour network; None without.
         opening: bands of the viewing direction open one after the other (`OpenLevels`) during this fraction of the
             training budget; 0: all are open.
@@ -191,7 +187,7 @@ class EncodedField(BoxField):
             return None
         if opening is not None and not opening.complete:
             return None
-        weights = _weights(head)
+        weights, _ = head.parameters_by_layer()
         fits = (weights[0].shape[1], weights[-1].shape[0]) == (self.num_features + self.direction_levels**2, 3)
         if head.bias or head.activation != "sigmoid" or not fits:
             return None
@@ -232,8 +228,3 @@ class EncodedField(BoxField):
             return spherical_harmonics(directions, levels)
         open_bands = spherical_harmonics(directions, opening.count)
         return opening.completed(open_bands, levels**2, 2 * opening.count - 1)
-
-
-def _weights(network: MLP) -> list[Tensor]:
-    """Return the weights of each layer."""
-    return [layer.weight for layer in network if isinstance(layer, nn.Linear)]

@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 from torch import Tensor, nn
 
+from nerfloom.base.config import Range, TrainConfig
 from nerfloom.encodings.coarse_to_fine import OpenLevels
 from nerfloom.fields.appearance import Appearance
 from nerfloom.fields.base import MLP, Field
 from nerfloom.geometry.points import Points
 from nerfloom.kernels.encodings.contraction import contract_to_unit
-from nerfloom.kernels.encodings.frequency import frequency_encoding
+from nerfloom.kernels.encodings.frequency import MAX_FREQUENCIES, frequency_encoding
+
+
+@dataclass(frozen=True)
+class NetworkConfig(TrainConfig):
+    """Settings of a method with a network like NeRF's; the defaults are the paper's."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "num_layers": (3, 64),
+        "hidden_width": (2, 2**14),
+        "position_frequencies": (0, MAX_FREQUENCIES),
+        "direction_frequencies": (0, MAX_FREQUENCIES),
+    }
+    num_layers: int = 8
+    """Layers before the density output."""
+    hidden_width: int = 256
+    """Features per layer."""
+    position_frequencies: int = 10
+    """Number of frequencies in the encoding of positions."""
+    direction_frequencies: int = 4
+    """Number of frequencies in the encoding of directions."""
 
 
 class NeRFField(Field):

@@ -21,10 +21,7 @@ FREQUENCIES = 2
 def density_normals(field: Field, points: Points) -> Tensor:
     """Return the unit directions (N, 3) of steepest descent of the density; 0 where its gradient is 0.
 
-    The field is evaluated once more. The result has no gradient.
-
-    Args:
-        points: N points.
+    The field is evaluated once more, at N points. The result has no gradient.
     """
     parameters = [p for p in field.parameters() if p.requires_grad]
     try:

@@ -197,9 +197,6 @@ class SurfaceField(Field):
         """Return a bound of the density (N,) within `cell` of each point, and no features, (N, 0).
 
         The inside counts as occupied: a surface that retreats during training must find its cells.
-
-        Args:
-            points: N points.
         """
         distances = self.distance.values(points.positions)
         return self.density_at(distances - self.cell), distances.new_zeros(len(points), 0)
@@ -211,13 +208,7 @@ class NeuSField(SurfaceField):
     sharpness: AnnealedSharpness
 
     def alpha(self, points: Points, directions: Tensor, deltas: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the opacity of intervals around points, and features.
-
-        Args:
-            points: N points, in the middle of their intervals.
-            directions: (N, 3) unit directions of their rays.
-            deltas: (N,) lengths of the intervals, scene units.
-        """
+        """Return the opacity of intervals around `points`, by `directions` and `deltas`, as `HasAlpha` does."""
         intervals = Intervals(directions, deltas, self.sharpness.share)
         return self.distance.samples(points.positions, self.sharpness(), intervals)
 

@@ -37,6 +37,11 @@ def intersect_box(origins: Tensor, directions: Tensor, box: Tensor) -> tuple[Ten
     return torch.where(hit, enter, zero), torch.where(hit, leave, zero)
 
 
+def half_edge(box: Tensor) -> float:
+    """Return half the edge of the cube with the volume of `box` (2, 3): the `scale` of an unbounded scene."""
+    return math.prod((box[1] - box[0]).tolist()) ** (1 / 3) / 2
+
+
 def nested_boxes(box: Tensor, levels: int) -> Tensor:
     """Return boxes of the same centre, each with twice the edges of the one before: Instant-NGP, appendix E.2.
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError
-from nerfloom.base.extras import install_command
+from nerfloom.base.extras import require
 from nerfloom.base.signals import stoppable
 from nerfloom.jobs.child import GRACE
 from nerfloom.jobs.execution import execute
@@ -57,8 +57,7 @@ class Ray(Launcher):
         Raises:
             LostProcessError: if the head of the cluster is lost.
         """
-        if (advice := install_command("cluster")) is not None:
-            raise ConfigError(f"--launcher ray needs a package that is not installed: {advice}")
+        require("cluster", "--launcher ray needs")
         ledger = Ledger(jobs, on_finished)
         waiting = ledger.unfinished()
         if not waiting:

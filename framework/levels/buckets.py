@@ -80,13 +80,10 @@ class Buckets:
                 advance(table.nbytes)
 
     def taken(self, index: int) -> Iterator[np.ndarray]:
-        """Yield the rows (n, width) of a bucket, and remove its file.
+        """Yield the rows (n, width) of the bucket `index`, and remove its file.
 
         All rows are yielded at once, unless the bucket is too large. A bucket is too large if very many Gaussians are
         at one place, where no plane can separate them.
-
-        Args:
-            index: index of the bucket.
         """
         file = self._file(index)
         if not file.exists():
@@ -120,12 +117,7 @@ def splits(points: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bucket_of(points: np.ndarray, axes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the index (N,) int64, from 0, of the cell of a kd-tree that contains each point.
-
-    Args:
-        points: (N, 3) positions.
-        axes, values: planes from `splits`.
-    """
+    """Return the index (N,) int64 of the cell of `axes` and `values`, from `splits`, for each of `points` (N, 3)."""
     cells, rows = np.zeros(len(points), np.int64), np.arange(len(points))
     for _ in range(len(axes).bit_length()):
         cells = 2 * cells + 1 + (points[rows, axes[cells]] > values[cells])

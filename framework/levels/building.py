@@ -103,21 +103,12 @@ def build_levels(file: Path, stream: GaussianStream, origin: Tensor, chunk_size:
 
 
 def rows_at_once(memory: float) -> int:
-    """Return the number of Gaussians that are read from a stream at a time.
-
-    Args:
-        memory: maximum memory for building, MB (1e6 bytes).
-    """
+    """Return the number of Gaussians that are read at a time if building may take `memory`, MB (1e6 bytes)."""
     return int(min(max(memory * 1e6 / (2 * COPIES * row_size(MAX_DEGREE, 32)), 1), MAX_ROWS))
 
 
 def survey(stream: GaussianStream, rows: int) -> Survey:
-    """Read a stream once: count its Gaussians, and choose a random sample of their centres.
-
-    Args:
-        stream: the Gaussians.
-        rows: maximum number of Gaussians that are read at a time.
-    """
+    """Read a `stream` once, `rows` at a time: count its Gaussians, and choose a random sample of their centres."""
     random = torch.Generator().manual_seed(0)
     total = count = terms = 0
     keys, sample = torch.zeros(0), torch.zeros(0, 3, dtype=torch.float64)

@@ -96,11 +96,7 @@ class DrawnLevels(Renderable):
         return every(self.rasteriser.draw(shown, camera, background).image, view.stride)
 
     def cut(self, view: View) -> Cut:
-        """Return the nodes that are drawn for a view.
-
-        Args:
-            view: the camera, in the frame of the scene.
-        """
+        """Return the nodes that are drawn for a `view`, in the frame of the scene."""
         return self._camera_and_cut(view)[1]
 
     def _camera_and_cut(self, view: View) -> tuple[SplatCamera, Cut]:

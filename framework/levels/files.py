@@ -43,7 +43,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.checked import checked
-from nerfloom.base.errors import DataError
+from nerfloom.base.errors import DataError, one_line
 from nerfloom.kernels.splats.project import DEGREES
 from nerfloom.levels.nodes import Nodes
 from nerfloom.splats.gaussians import COLUMNS, Gaussians
@@ -101,10 +101,7 @@ class LevelsFile:
         return 4 * sum(_widths(self.degree).values())
 
     def read(self, index: int) -> Gaussians:
-        """Read the Gaussians of a node, float32.
-
-        Args:
-            index: index of the node.
+        """Read the Gaussians of the node `index`, float32.
 
         Raises:
             DataError: if the file cannot be read, or has changed or is damaged at this place.
@@ -126,15 +123,11 @@ class LevelsFile:
         for name, width in _widths(self.degree).items():
             kind = _kind(name, self.bits)
             end = place + count * width * kind.itemsize
-            columns[name] = torch.from_numpy(content[place:end].view(kind).astype(np.float32))
+            columns[name] = torch.from_numpy(content[place:end].view(kind).astype(np.float32)).view(count, width)
             place = end
-        shapes = {"logits": (count,), "harmonics": (count, 3, DEGREES[self.degree])}
-        return Gaussians.of(
-            {
-                name: values.view(shapes.get(name, (count, _widths(self.degree)[name])))
-                for name, values in columns.items()
-            }
-        )
+        columns["logits"] = columns["logits"][:, 0]
+        columns["harmonics"] = columns["harmonics"].view(count, 3, DEGREES[self.degree])
+        return Gaussians.of(columns)
 
 
 class LevelsWriter:
@@ -178,12 +171,7 @@ class LevelsWriter:
         return index
 
     def finish(self, origin: Tensor, look: Look) -> None:
-        """Write the header.
-
-        Args:
-            origin: (3,) origin of the file's coordinates in the frame of the input.
-            look: the settings of drawing.
-        """
+        """Write the header, with the `origin` (3,) of coordinates in the input's frame, and the `look` of drawing."""
         facts = {"version": VERSION, "degree": self.degree, "bits": self.bits, "origin": origin.tolist()}
         text = json.dumps({**facts, "look": asdict(look), **self._header}, separators=(",", ":"), allow_nan=False)
         content, begin = text.encode(), self.stream.tell()
@@ -198,22 +186,16 @@ def is_levels_file(path: Path) -> bool:
 
 
 def row_size(degree: int, bits: Bits) -> int:
-    """Return the size of a Gaussian in a file, bytes.
-
-    Args:
-        degree: degree of the harmonics.
-        bits: bits of each number but the centres.
-    """
+    """Return the bytes of a Gaussian in a file, with harmonics of `degree` and `bits` of each number but centres."""
     return sum(width * _kind(name, bits).itemsize for name, width in _widths(degree).items())
 
 
 def chunk_starts(counts: Sequence[int], degree: int, bits: Bits) -> list[int]:
-    """Return the position of each chunk and, last, of the header.
+    """Return the positions of the chunks of `counts` Gaussians, and last of the header.
 
-    Args:
-        counts: number of Gaussians of each node.
-        degree: degree of the harmonics.
-        bits: bits of each number but the centres.
+    `degree` and `bits` are as in `row_size`.
+
+    `degree` and `bits` are as in `row_size`.
     """
     row = row_size(degree, bits)
     filled = [-(-count * row // ALIGNMENT) * ALIGNMENT for count in counts]
@@ -221,10 +203,7 @@ def chunk_starts(counts: Sequence[int], degree: int, bits: Bits) -> list[int]:
 
 
 def read_levels(file: Path) -> LevelsFile:
-    """Open a file of levels: read and check its header. Chunks are read later.
-
-    Args:
-        file: path of the file.
+    """Open a `file` of levels: read and check its header. Chunks are read later.
 
     Raises:
         DataError: if the file cannot be read, is damaged, or is something else.
@@ -235,8 +214,9 @@ def read_levels(file: Path) -> LevelsFile:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror or error}") from error
     except (ValueError, LookupError, ArithmeticError, TypeError, RecursionError) as error:
-        because = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DataError(f"{file} is not a file of levels, or is damaged: {because}; copy or export it again") from error
+        raise DataError(
+            f"{file} is not a file of levels, or is damaged: {one_line(error)}; copy or export it again"
+        ) from error
 
 
 def _header(file: Path) -> tuple[dict[str, Any], int]:

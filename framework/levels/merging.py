@@ -104,8 +104,7 @@ def merged(gaussians: Gaussians, size: int) -> Gaussians:
 def surfaces(log_scales: Tensor) -> Tensor:
     """Return the surfaces (N,) float64 of ellipsoids by Knud Thomsen's formula.
 
-    Args:
-        log_scales: (N, 3) logarithms of the half axes.
+    `log_scales` (N, 3) are the logarithms of the half axes.
     """
     a, b, c = log_scales.double().exp().unbind(-1)
     products = torch.stack([a * b, a * c, b * c], dim=-1)

@@ -53,10 +53,5 @@ class Nodes:
         return leaves
 
     def of_parents(self, values: Tensor, of_root: float) -> Tensor:
-        """Return the value (M,) of the node above each node.
-
-        Args:
-            values: (M,) values of the nodes.
-            of_root: value for the root, which has no node above.
-        """
+        """Return the value (M,) of the node above each node, from `values` (M,) of nodes; `of_root` for the root."""
         return torch.where(self.parents >= 0, values[self.parents.clamp(min=0)], of_root)

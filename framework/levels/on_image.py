@@ -45,12 +45,7 @@ def tangents(camera: Cameras, blur: float) -> Tensor:
 
 
 def reaches(logits: Tensor, log_scales: Tensor) -> Tensor:
-    """Return how far (N,) float64 from their centres Gaussians are drawn.
-
-    Args:
-        logits: (N,) opacities before the sigmoid.
-        log_scales: (N, 3) logarithms of the standard deviations.
-    """
+    """Return how far (N,) float64 from their centres Gaussians of `logits` (N,) and `log_scales` (N, 3) are drawn."""
     opacities = torch.sigmoid(logits.double())
     sizes = log_scales.double().amax(1).exp()
     return (2 * (opacities / MIN_ALPHA).clamp(min=1).log()).sqrt() * sizes

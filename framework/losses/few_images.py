@@ -28,7 +28,6 @@ class FewImagesConfig(RayConfig):
         "occlusion_loss_mult": AT_LEAST_0,
         "occlusion_range": AT_LEAST_0,
     }
-    """Allowed ranges."""
     few_images: Auto[bool] = AUTO
     """Whether to use the defaults for few images in the settings below. auto: with up to 12 training images of a static
     scene, or 8 with an alpha channel."""

@@ -30,11 +30,8 @@ class NormalPenalty(LossTerm):
     """Mean over rays of a penalty of `normal_penalties`, "normals" or "orientation", from the renderer's extras."""
 
     def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        rendered, key = shown.rendered, f"{self.name}_penalty"
-        if not len(rendered.rgb):
-            return None
-        penalty: Tensor = rendered.extras[key].mean()
-        return penalty
+        penalty: Tensor = shown.rendered.extras[f"{self.name}_penalty"]
+        return penalty.mean() if len(penalty) else None
 
 
 class PredictedNormals(LossTerm):
@@ -66,7 +63,6 @@ class PredictedNormals(LossTerm):
 
 
 PREDICTED_NORMALS = PredictedNormals()
-"""The term."""
 
 
 def penalties(rendered: Rendered, rays: Rays, field: Field) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -210,54 +211,54 @@ def known_points(batch: PixelBatch, box: Tensor) -> KnownPoints:
     return KnownPoints(rays[inside], enter[inside], batch.distances[inside], batch.deviations[inside])
 
 
-class SurfacePoints(LossTerm):
+class PointsTerm(LossTerm):
+    """A mean error of distances by points of a reconstruction, in halves of the box's shortest edge."""
+
+    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
+        return batch.deviations is not None
+
+    def __call__(self, shown: RenderedBatch) -> Tensor | None:
+        field = shown.model.field
+        assert isinstance(field, SurfaceField)
+        known = known_points(shown.batch, field.box)
+        return self.errors(field, known).mean() / field.size if len(known.distances) else None
+
+    @abstractmethod
+    def errors(self, field: SurfaceField, known: KnownPoints) -> Tensor:
+        """Return errors of `field` by K `known` points, K > 0, scene units, in any shape."""
+
+
+class SurfacePoints(PointsTerm):
     """Distance at points of a reconstruction, which lie on surfaces: Geo-NeuS (Fu et al. 2022).
 
-    It is the mean excess of |f| over the point's standard deviation, in halves of the box's shortest edge.
+    The error is the excess of |f| over the point's standard deviation.
     """
 
     def __init__(self) -> None:
         super().__init__("points", "points_loss_mult")
 
-    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
-        return batch.deviations is not None
-
-    def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        field = shown.model.field
-        assert isinstance(field, SurfaceField)
-        known = known_points(shown.batch, field.box)
-        if not len(known.distances):
-            return None
+    def errors(self, field: SurfaceField, known: KnownPoints) -> Tensor:
         found = field.shape(known.places(known.distances)).distances
-        return torch.relu(found.abs() - known.deviations).mean() / field.size
+        return torch.relu(found.abs() - known.deviations)
 
 
-class DistanceBounds(LossTerm):
+class DistanceBounds(PointsTerm):
     """Bounds of the distance at random positions before and behind points of a reconstruction, on rays that see them.
 
     If an image shows a point, space in front of the point is empty: the signed distance there is positive, and at most
     the distance to the point. Space just behind the point counts as solid: the signed distance there is negative, and
-    its magnitude is at most the distance to the point. The term is the mean excess over these bounds, in halves of the
-    box's shortest edge.
+    its magnitude is at most the distance to the point. The error is the excess over these bounds.
     """
 
     def __init__(self) -> None:
         super().__init__("bounds", "bounds_loss_mult")
 
-    def applies(self, batch: PixelBatch, model: RayModel[Any]) -> bool:
-        return batch.deviations is not None
-
-    def __call__(self, shown: RenderedBatch) -> Tensor | None:
-        field = shown.model.field
-        assert isinstance(field, SurfaceField)
-        known = known_points(shown.batch, field.box)
-        if not len(known.distances):
-            return None
+    def errors(self, field: SurfaceField, known: KnownPoints) -> Tensor:
         before = (known.distances - known.entries) * torch.rand_like(known.distances)
         behind = -BEHIND * field.size * torch.rand_like(known.distances)
         left = torch.stack([before, behind])
         found = field.shape(known.places(known.distances - left).flatten(0, 1)).distances.view_as(left)
-        return beyond_bounds(found, left, known.deviations).mean() / field.size
+        return beyond_bounds(found, left, known.deviations)
 
 
 def beyond_bounds(distances: Tensor, left: Tensor, deviations: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.data.pixels.batch import PixelBatch
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.losses.functions import (
     density_before,
     depth_error,
@@ -17,7 +18,6 @@ from nerfloom.losses.functions import (
     normalised_distortion,
 )
 from nerfloom.losses.term import LossTerm, RenderedBatch
-from nerfloom.samplers.proposal import half_edge
 
 if TYPE_CHECKING:
     from nerfloom.ray_model import RayModel

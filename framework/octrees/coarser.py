@@ -22,11 +22,7 @@ from nerfloom.octrees.packing import packed, packed_depths
 
 
 def halved(octree: Octree) -> Octree:
-    """Return an octree with cells of twice the edge.
-
-    Args:
-        octree: the octree, of one level.
-    """
+    """Return `octree`, of one level, with cells of twice the edge."""
     layout, depths, coefficients = _joined(octree.layout, octree.leaves.depths(), octree.leaves.coefficients())
     return replace(octree, layout=layout, leaves=packed(depths, coefficients)[0])
 
@@ -34,10 +30,7 @@ def halved(octree: Octree) -> Octree:
 def with_levels(octree: Octree) -> Octree:
     """Return an octree with coarser levels, down to a single leaf. The finest level stays as it is.
 
-    A box around others keeps its leaves, and gets larger ones from the others.
-
-    Args:
-        octree: the octree, as in its file.
+    The octree is as in its file. A box around others keeps its leaves, and gets larger ones from the others.
     """
     leaves, given = octree.leaves, octree.layout.levels
     firsts, levels, parts = octree.layout.firsts_of_levels, list[OctreeLayout](), list[tuple[Tensor, ...]]()

@@ -71,12 +71,7 @@ class DrawsOctree(RendersRays):
         """Largest error of a colour channel of a ray that ends at once: `error_bound` at a transmittance of 1."""
 
     def render(self, rays: Rays, background: Tensor) -> Rendered:
-        """Render R rays; colours are not clamped.
-
-        Args:
-            rays: the rays; R may be 0.
-            background: (R, 3) or (3,) colour in [0, 1] of the background.
-        """
+        """Render R rays, perhaps 0; colours are not clamped."""
         light = self.light(rays, background, self.early_stop / self.largest)
         visits = light.visits.sum()
         return Rendered(

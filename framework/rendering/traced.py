@@ -23,11 +23,7 @@ def error_of_traced(
     """Return the mean squared error of pixels in training mode, computed by `traced_error`.
 
     Args:
-        rays: R rays.
         pixels: target pixels.
-        sampler: chooses the positions along each ray.
-        field: density and colour.
-        renderer: turns samples into colours.
         thin: as in `traced_error`.
 
     Returns:
@@ -45,11 +41,7 @@ def traced_rays(rays: Rays, background: Tensor, sampler: Sampler, field: Field, 
     """Render rays outside of training by `traced_colors`, without weights and samples.
 
     Args:
-        rays: R rays.
         background: (3,) colour in [0, 1].
-        sampler: chooses the positions along each ray.
-        field: density and colour.
-        renderer: turns samples into colours.
 
     Returns:
         None if gradients are enabled, if there are no rays, or if a part overrides the basic computation.

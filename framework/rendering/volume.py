@@ -13,6 +13,7 @@ from torch import Tensor
 from nerfloom.base.config import RayConfig
 from nerfloom.data.scene import Scene
 from nerfloom.fields.base import Field, HasAlpha
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.geometry.points import sample_points
 from nerfloom.geometry.rays import Rays, Samples
 from nerfloom.kernels.compositing.alpha import composite_alpha
@@ -21,7 +22,6 @@ from nerfloom.kernels.compositing.thinning import thinned
 from nerfloom.kernels.math import at_least_float32, scale_gradient
 from nerfloom.rendering.rendered import Rendered
 from nerfloom.rendering.renderer import Renderer
-from nerfloom.samplers.proposal import half_edge
 
 
 class VolumeRenderer(Renderer):
@@ -65,19 +65,20 @@ class VolumeRenderer(Renderer):
     def values(self, rays: Rays, samples: Samples, field: Field) -> tuple[Tensor, Tensor]:
         """Return the density or alpha (N,) of samples, and their colours (N, 3); in training with changed gradients.
 
-        Args:
-            rays: R rays.
-            samples: N samples along the rays, with density or alpha, and features, attached.
-            field: the field that was sampled.
-
-        Raises:
-            ValueError: if the samples have no density or no features.
+        `rays`, `samples`, `field` and the error raised are as in `shade`.
         """
-        factors = None
+        stopping = samples.sigma if samples.alpha is None else samples.alpha
+        if stopping is None or samples.features is None:
+            raise ValueError("rendering needs samples with density and features")
+        owners = samples.ray_indices
+        cameras = None if rays.camera_indices is None else rays.camera_indices.index_select(0, owners)
+        rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)
+        if self.training and self.thin and rays.origins.device.type == "cpu":
+            stopping, rgb = thinned(stopping, rgb, self.thin)
         if self.training and self.unit_length is not None:
             factors = (samples.t / self.unit_length).square().clamp(max=1)
-        thin = self.thin if self.training and rays.origins.device.type == "cpu" else 0.0
-        return sample_values(rays, samples, field, factors, thin)
+            stopping, rgb = scale_gradient(stopping, factors), scale_gradient(rgb, factors)
+        return stopping, rgb
 
 
 def scaled_up_to(config: RayConfig, scene: Scene) -> float | None:
@@ -95,34 +96,6 @@ def evaluated(rays: Rays, samples: Samples, field: Field) -> Samples:
         alpha, features = field.alpha(points, directions, samples.deltas)
         return samples.with_alpha(alpha, features)
     return samples.evaluated(*field.density(points))
-
-
-def sample_values(
-    rays: Rays, samples: Samples, field: Field, gradient_factors: Tensor | None = None, thin: float = 0.0
-) -> tuple[Tensor, Tensor]:
-    """Return the density or alpha (N,) of samples, and their colours (N, 3).
-
-    Args:
-        rays: R rays.
-        samples: N samples along the rays, with density or alpha, and features, attached.
-        field: the field, which computes colours from features and directions.
-        gradient_factors: (N,) factors of the gradients of density (or alpha) and colour; None for 1.
-        thin: samples are thinned below this fraction of the mean gradient; 0 for none.
-
-    Raises:
-        ValueError: if the samples have no density or no features.
-    """
-    stopping = samples.sigma if samples.alpha is None else samples.alpha
-    if stopping is None or samples.features is None:
-        raise ValueError("rendering needs samples with density and features")
-    owners = samples.ray_indices
-    cameras = None if rays.camera_indices is None else rays.camera_indices.index_select(0, owners)
-    rgb = field.color(samples.features, rays.directions.index_select(0, owners), cameras)
-    if thin:
-        stopping, rgb = thinned(stopping, rgb, thin)
-    if gradient_factors is not None:
-        stopping, rgb = scale_gradient(stopping, gradient_factors), scale_gradient(rgb, gradient_factors)
-    return stopping, rgb
 
 
 def volume_render(

@@ -29,7 +29,6 @@ class BackgroundConfig(SamplingConfig):
     """Settings of a method that can show the outside of the scene's box."""
 
     RANGES: ClassVar[dict[str, Range]] = {"num_background_samples": (1, 2**14)}
-    """Allowed ranges."""
     background_model: Auto[Literal["none", "sphere", "contraction"]] = AUTO
     """Model of the outside of the scene's box. none: nothing. sphere: a second field in inverse distance (NeRF++),
     outside a sphere (--sphere-around). contraction: the same field, contracted; not with --sampler hierarchical. auto:

@@ -17,11 +17,12 @@ from nerfloom.data.scene import Scene
 from nerfloom.encodings.planes import FeaturePlanes
 from nerfloom.fields.base import Field
 from nerfloom.fields.encoded import DensityField
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.samplers.base import Sampler
 from nerfloom.samplers.hierarchical import MIN_COARSE, HierarchicalSampler
 from nerfloom.samplers.motion import vertices_in_time
 from nerfloom.samplers.occupancy import MAX_CELLS, MAX_LEVELS, OccupancySampler
-from nerfloom.samplers.proposal import LEARN_EVERY, ProposalSampler, half_edge
+from nerfloom.samplers.proposal import LEARN_EVERY, ProposalSampler
 
 NESTED_CELLS = 64
 """Cells along each axis of each nested box, a multiple of 4; 128 in Instant-NGP."""
@@ -53,9 +54,7 @@ class SamplingConfig(RayConfig):
         "num_proposal_samples": (1, 2**14),
         "num_nerf_samples": (1, 2**14),
     }
-    """Minimum and maximum of these settings."""
     GONE: ClassVar[dict[str, Any]] = {"silhouette_pixels": True, "nested_resolution": NESTED_CELLS}
-    """Settings of earlier versions."""
     sampler: Auto[Literal["occupancy", "proposal"]] = AUTO
     """occupancy: march through the occupied cells of the box, or of nested boxes if the scene may extend beyond the
     box. proposal: small density fields choose the samples. auto: proposal if the scene may extend beyond the box,
@@ -98,7 +97,6 @@ class HierarchicalConfig(SamplingConfig):
     """Settings of a method that can also be sampled hierarchically, with a coarse and a fine field, as in NeRF."""
 
     RANGES: ClassVar[dict[str, Range]] = {"num_coarse_samples": (MIN_COARSE, 2**14), "num_fine_samples": (1, 2**14)}
-    """Minimum and maximum of these settings."""
     sampler: Auto[Literal["hierarchical", "occupancy", "proposal"]] = AUTO  # type: ignore[assignment]
     """hierarchical: a coarse and a fine field. occupancy: one field and an occupancy grid. proposal: one field, and
     small density fields that choose the samples in all of space, contracted. auto: proposal if the scene may extend
@@ -203,6 +201,8 @@ def make_sampler(
     make_coarse: Callable[[], Field | None] | None = None,
     proposals: Sequence[Field] | None = None,
     learn_every: int = LEARN_EVERY,
+    ladder: float | None = None,
+    blurs: tuple[float, ...] = (),
 ) -> Sampler:
     """Return the sampler that the settings select.
 
@@ -212,6 +212,7 @@ def make_sampler(
         proposals: density fields of `--sampler proposal`. If None, they are hash grids, or planes in space and time for
             a method that learns motion.
         learn_every: number of steps from one update of the proposals to the next.
+        ladder, blurs: as in `ProposalSampler`.
 
     Raises:
         ConfigError: if the hierarchical sampler is selected and the method has no coarse level.
@@ -230,6 +231,8 @@ def make_sampler(
             endless=scene.unbounded and not scene.has_alpha,
             fields=proposals,
             learn_every=learn_every,
+            ladder=ladder,
+            blurs=blurs,
         )
     elif str(config.sampler) == "hierarchical":
         if make_coarse is None:

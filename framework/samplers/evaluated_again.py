@@ -14,13 +14,10 @@ from nerfloom.samplers.wrapping import WrappingSampler
 
 
 class EvaluatedAgain(WrappingSampler):
-    """Samples of another sampler; if rays require a gradient, the renderer evaluates the field at them once more.
+    """Samples of another `sampler`; if rays require a gradient, the renderer evaluates the field at them once more.
 
     The distances of samples along their rays have no gradient, as with all samplers. Their positions, densities or
     opacities, and colours have the gradient of the rays.
-
-    Args:
-        sampler: chooses the samples.
     """
 
     def __init__(self, sampler: Sampler) -> None:

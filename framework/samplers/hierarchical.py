@@ -67,14 +67,7 @@ class HierarchicalSampler(Sampler):
         middles = (t[:, 1:] + t[:, :-1]) / 2
         drawn = inverse_cdf(middles, weights[:, 1:-1], uniform_variates(len(rays), self.num_fine, jitter, t.device))
         merged = samples_from_points(torch.cat([t, drawn], dim=-1).sort(dim=-1).values)
-        return Samples(
-            merged.t_starts,
-            merged.t_ends,
-            merged.offsets,
-            merged.points,
-            merged.per_ray,
-            coarse=CoarseLevel(coarse, samples),
-        )
+        return replace(merged, coarse=CoarseLevel(coarse, samples))
 
     def _of_intervals(self, rays: Rays, field: Field, jitter: bool) -> Samples:
         edges = stratified_edges(rays, self.num_coarse, jitter)

@@ -23,7 +23,6 @@ class MotionConfig(RayConfig):
     """Settings of a method that learns motion."""
 
     RANGES: ClassVar[dict[str, Range]] = {"time_slices": (1, 2**10)}
-    """Allowed ranges."""
     smallest_box: bool = True
     """Learn only the part of the box that silhouettes show to be occupied at some time (occupancy)."""
     time_slices: Auto[int] = AUTO

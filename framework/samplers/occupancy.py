@@ -312,10 +312,6 @@ class OccupancySampler(Sampler):
         cells of nested boxes count as occupied. Afterwards, one part is drawn from all cells that are not carved, so
         that an empty cell can become occupied again. Further parts are drawn from the occupied cells and from their
         neighbours.
-
-        Args:
-            step: number of training steps done.
-            density: density of the field.
         """
         warming_up = step < WARM_UP_STEPS
         if self.levels > 1:

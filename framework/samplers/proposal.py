@@ -10,7 +10,6 @@ beyond, or it follows Zip-NeRF's power ladder.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -24,7 +23,7 @@ from nerfloom.base.step_kind import StepKind
 from nerfloom.encodings.hash_grid import HashGrid
 from nerfloom.fields.base import DensityFunction, Field, HasGridDensity
 from nerfloom.fields.encoded import DensityField
-from nerfloom.geometry.bounds import intersect_box
+from nerfloom.geometry.bounds import half_edge, intersect_box
 from nerfloom.geometry.points import Footprint, Points, sample_points
 from nerfloom.geometry.rays import Histogram, Rays, Samples
 from nerfloom.kernels.histograms.intervals import interval_weights, proposal_excess, resample
@@ -218,11 +217,6 @@ def density_of(proposal: Field) -> DensityFunction | GridDensity:
     """Return the density of a field `proposal`; in the kernels' form if it is a small network on a hash grid."""
     known = proposal.grid_density() if isinstance(proposal, HasGridDensity) else None
     return proposal.density if known is None else known
-
-
-def half_edge(box: Tensor) -> float:
-    """Return half the edge of the cube with the volume of `box` (2, 3): the `scale` of an unbounded scene."""
-    return math.prod((box[1] - box[0]).tolist()) ** (1 / 3) / 2
 
 
 def interlevel_loss(samples: Samples, weights: Tensor, blurs: Sequence[float] = ()) -> Tensor:

@@ -66,8 +66,7 @@ def times_seen(cameras: Cameras, nearest: Tensor, box: Tensor, resolution: int, 
     beyond the image's edge. The cell's centre must also be beyond the camera's nearest distance.
 
     Args:
-        cameras: M cameras.
-        nearest: (M,) distance of each camera that its image shows to be empty, scene units.
+        cameras, nearest: as in `CovisibleSpace.exclude`.
         box: (2, 3) minimum and maximum corner, scene units.
         resolution: number n of cells along each axis, a multiple of `BLOCK`.
         most: maximum count.

@@ -57,9 +57,7 @@ class HiddenCells(nn.Module):
         """Find the cells in the sphere that at least `least` images show, or all images if there are fewer.
 
         Args:
-            cameras: M training cameras.
-            nearest: (M,) distance of each camera that its image shows to be empty, scene units.
-            least: minimum number of images, at least 1.
+            cameras, nearest, least: as in `CovisibleSpace.exclude`.
             sphere: (4,) centre and radius of the sphere that has the rays' samples, scene units.
         """
         least, sphere = min(least, len(cameras)), sphere.to(self.box)

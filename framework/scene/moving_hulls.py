@@ -57,13 +57,8 @@ def moving_hulls(
 def moving_box(silhouettes: Silhouettes, box: Tensor, times: Tensor, bound: MotionBound) -> Tensor:
     """Return the smallest box (2, 3) within `box` of everything that may be occupied at any time in a moving scene.
 
-    If no image has matter at its border, space outside the images' frames also counts as empty.
-
-    Args:
-        silhouettes: silhouettes of the M training images.
-        box: (2, 3) minimum and maximum corner.
-        times: (M,) times of the images, in [0, 1].
-        bound: distance that matter may have moved up to each time.
+    If no image has matter at its border, space outside the images' frames also counts as empty. `silhouettes`, `box`,
+    `times` and `bound` are as in `moving_hulls`.
     """
     silhouettes = silhouettes.closed_if_whole()
     for _ in range(3):  # with smaller cells in each round

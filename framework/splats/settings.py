@@ -74,7 +74,6 @@ class SplattingConfig(
         "reduced_until": (0, 1),
         "memory_limit": AT_LEAST_0,
     }
-    """Allowed range of each numeric setting."""
     changing_light = "affine"
     degree: int = 3
     """Highest degree of the spherical harmonics of colours."""

@@ -138,13 +138,9 @@ def _few(parser: DataParser, data: Path | None, split: Split, count: int) -> Dat
 
 
 def reduced(dataset: Dataset, side: int) -> Dataset:
-    """Return images reduced by the largest integer factor with a longest side of at least `side` pixels.
+    """Return images of a `dataset` reduced by the largest integer factor with a longest side of `side` pixels or more.
 
     A reduced pixel counts if masks keep all of its pixels. Depth images are omitted.
-
-    Args:
-        dataset: the images.
-        side: minimum longer side of the largest image, pixels.
     """
     factor = max(dataset.scene.image_size // side, 1)
 

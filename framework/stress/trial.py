@@ -159,13 +159,9 @@ def blank_psnr(model: Model[Any], test: Dataset) -> float:
 
 
 def unsound(trainer: Trainer, test: Dataset) -> str | None:
-    """Return which parameter, running error or value of the first test view is not finite; None if all are finite.
+    """Return which parameter, running error or value of the first `test` view of a `trainer` is not finite, or None.
 
     The PSNR alone would hide an infinite colour, because it is computed on colours clamped to [0, 1].
-
-    Args:
-        trainer: the trainer, after training.
-        test: the test images.
     """
     for name, parameter in trainer.model.named_parameters():
         if not all_finite([parameter]):

@@ -176,7 +176,7 @@ def check_radius(radius: float | None) -> None:
 
 @dataclass(frozen=True)
 class CameraPathSettings(LensSettings):
-    """Cameras of a file, camera_path.json, in the format of nerfstudio's viewer."""
+    """The cameras of a file, camera_path.json, in the format of nerfstudio's viewer."""
 
     camera_path_filename: Path = Path("camera_path.json")
     """File of the cameras, of ns-viewer, of nerfstudio's viewer or its Blender add-on."""
@@ -238,7 +238,7 @@ class OrbitSettings(FlightSettings):
 
 @dataclass(frozen=True)
 class TimeSettings(FramesSettings):
-    """The view of one camera while time runs from 0 to 1."""
+    """The view of one camera while time runs from 0 to 1; a PNG file shows the frames side by side."""
 
     seconds: float = 4.0
     """Duration, seconds."""
@@ -251,7 +251,7 @@ class TimeSettings(FramesSettings):
 
 @dataclass(frozen=True)
 class DatasetSettings(PathSettings):
-    """Each camera of a split, in a folder OUTPUT_PATH/SPLIT/OUTPUT/IMAGE.png."""
+    """Each camera of a split, to a folder, OUTPUT_PATH/SPLIT/OUTPUT/IMAGE.png, or to a video."""
 
     rendered_output_names: tuple[str, ...] = ("rgb", "gt-rgb")
     """Outputs, each in a folder: as of other paths, gt-rgb: the photograph, and error: the difference from it."""

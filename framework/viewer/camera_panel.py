@@ -38,7 +38,7 @@ class CameraPanel:
         self._go = client.gui.add_button("Go to the photograph")
         self._note = client.gui.add_markdown("")
         self._shown.on_update(lambda _: self._show())
-        self._go.on_click(lambda _: self._visit())
+        self._go.on_click(lambda _: self.step(0))
 
     def _show(self) -> None:
         """Add or remove the cameras; their thumbnails follow one by one."""
@@ -88,19 +88,14 @@ class CameraPanel:
         """Stop reading thumbnails when the browser has left."""
         self._generation += 1
 
-    def _visit(self) -> None:
+    def step(self, count: int) -> None:
+        """Move the browser's camera to the photograph `count` after the one with the index that is shown."""
         cameras = self._photographs.cameras
         if cameras is None:
             self._note.content = "The photographs cannot be read."
             return
-        self.visit(int(number_in(self._number.value, 0, len(cameras) - 1, 0)))
-
-    def step(self, count: int) -> None:
-        """Move the browser's camera to the photograph `count` after the last one."""
-        cameras = self._photographs.cameras
-        if cameras is not None:
-            last = int(number_in(self._number.value, 0, len(cameras) - 1, 0))
-            self.visit((last + count) % len(cameras))
+        shown = int(number_in(self._number.value, 0, len(cameras) - 1, 0))
+        self.visit((shown + count) % len(cameras))
 
     def visit(self, index: int) -> None:
         """Move the browser's camera to the photograph `index`."""

@@ -25,14 +25,9 @@ SIZE = 1 / 300
 
 
 class FloaterPanel:
-    """Controls of one browser for floaters.
+    """Controls of one browser `client` for floaters, in the model of a `queue`, at the time of the browser's `request`.
 
     They are looked for in the thread that draws, because a model in training changes between its steps.
-
-    Args:
-        client: the browser.
-        queue: holds the model, and runs work between pictures.
-        request: function that returns the browser's request; None if its camera is invalid.
     """
 
     def __init__(self, client: viser.ClientHandle, queue: RenderQueue, request: Callable[[], Request | None]) -> None:

@@ -110,15 +110,10 @@ def through(values: Tensor, places: Tensor, closed: bool) -> Tensor:
 
 
 def poses_through(poses: Tensor, places: Tensor, closed: bool) -> Tensor:
-    """Return poses on a smooth path through given poses.
+    """Return poses on a smooth path through `poses` (K, 3, 4) float64; `places` and `closed` are as in `through`.
 
     Positions and rotation matrices are on splines; a rotation is the one closest to its matrix. Between two neighbours
     that look in opposite directions, the path is arbitrary.
-
-    Args:
-        poses: (K, 3, 4) float64, camera-to-scene.
-        places: (F,) as in `through`.
-        closed: as in `through`.
     """
     matrices = through(poses, places, closed)
     return torch.cat([nearest_rotations(matrices[:, :, :3]), matrices[:, :, 3:]], dim=-1)

@@ -30,14 +30,9 @@ LONGEST = 1e9
 
 
 class MeasurePanel:
-    """Controls of one browser for measuring.
+    """Controls of one browser `client` for measuring, in the model of a `queue`, in views of the browser's `request`.
 
     Points are found in the thread that draws, because a model in training changes between its steps.
-
-    Args:
-        client: the browser.
-        queue: holds the model and its scale, and runs work between pictures.
-        request: function that returns the browser's request; None if its camera is invalid.
     """
 
     def __init__(self, client: viser.ClientHandle, queue: RenderQueue, request: Callable[[], Request | None]) -> None:

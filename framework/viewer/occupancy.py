@@ -14,14 +14,10 @@ MAX_CELLS = 40_000
 
 
 def shown_cells(model: Renderable, most: int = MAX_CELLS) -> tuple[Tensor, float] | None:
-    """Return the centres (N, 3) of occupied cells that have an empty neighbour, and the mean edge of a cell.
+    """Return centres (N, 3) of occupied cells of a `model` that have an empty neighbour, and the mean edge of a cell.
 
     Inner cells would not be visible. With nested boxes, the cells of the smallest box are shown. If there are more than
     `most` cells, evenly spaced ones are returned.
-
-    Args:
-        model: the model.
-        most: maximum number N.
 
     Returns:
         Positions in scene coordinates, and the edge length; None if the method skips no cells.

@@ -173,12 +173,9 @@ class Photographs:
 
 
 def small_picture(path: Path) -> np.ndarray | None:
-    """Return an image reduced to `THUMBNAIL` pixels over white, (H, W, 3) uint8; None if it cannot be read.
+    """Return the image `path` reduced to `THUMBNAIL` pixels over white, (H, W, 3) uint8; None if it cannot be read.
 
     A JPEG is decoded at an eighth of its size if that suffices.
-
-    Args:
-        path: the file.
     """
     try:
         with Image.open(Content(path)) as image:

@@ -116,29 +116,23 @@ class RenderQueue:
         """Do a task or draw the next piece for a browser, and return the seconds it took; None if there is none."""
         with self._lock:
             browsers = list(self._browsers.values())
+        now, start = time.monotonic(), time.perf_counter()
         if self._tasks:
-            return self._done(self._tasks.popleft())
-        now = time.monotonic()
+            try:
+                self._tasks.popleft()()
+            except PROBLEMS as error:
+                say(f"viewer: {one_line(error)}")
+            return time.perf_counter() - start
         index = next_browser([one.waiting(self.loaded.step, now) for one in browsers], now, REFINE_AFTER)
         if index is None:
             return None
         browser = browsers[index]
-        start = time.perf_counter()
         try:
             self._serve(browser)
         except PROBLEMS as error:
             say(f"viewer: a picture could not be drawn: {one_line(error)}")
             browser.drawn, browser.pieces, browser.step = browser.wanted, [], self.loaded.step
         browser.served_at = time.monotonic()
-        return time.perf_counter() - start
-
-    def _done(self, task: Callable[[], None]) -> float:
-        """Do a task, and return the seconds it took."""
-        start = time.perf_counter()
-        try:
-            task()
-        except PROBLEMS as error:
-            say(f"viewer: {one_line(error)}")
         return time.perf_counter() - start
 
     def _serve(self, browser: Browser) -> None:

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from nerfloom.base.console import say
 from nerfloom.base.errors import ConfigError, FlagError
-from nerfloom.base.extras import install_command
+from nerfloom.base.extras import require
 
 if TYPE_CHECKING:
     import viser
@@ -29,8 +29,7 @@ EVERYWHERE = ("0.0.0.0", "::")
 
 def check_installed() -> None:
     """Raise ConfigError, with the install command, if viser is missing; call it before anything slow."""
-    if (command := install_command("viewer")) is not None:
-        raise ConfigError(f"the viewer needs viser: {command}")
+    require("viewer", "the viewer needs")
 
 
 def free_port(host: str, port: int) -> int:
@@ -58,8 +57,8 @@ def free_port(host: str, port: int) -> int:
     raise ConfigError(f"--websocket-port {port}: no port from this one on is usable ({reason})")
 
 
-def open_server(host: str, port: int, label: str) -> viser.ViserServer:
-    """Start the server on `host` at `port`, or the next free one, with a panel `label`, and report its address.
+def open_server(host: str, port: int) -> viser.ViserServer:
+    """Start the server on `host` at `port`, or the next free one, and report its address.
 
     Raises:
         ConfigError: if viser is missing, or the address cannot be used.
@@ -72,7 +71,7 @@ def open_server(host: str, port: int, label: str) -> viser.ViserServer:
     # Browsers may leave while a picture is drawn for them.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     with redirect_stdout(io.StringIO()):  # viser prints a table of addresses
-        server = viser.ViserServer(host=host, port=chosen, label=label, verbose=False)
+        server = viser.ViserServer(host=host, port=chosen, label="nerfloom", verbose=False)
     _refuse(server, is_local=is_loopback(host))
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     bound = server.get_port()

@@ -54,7 +54,7 @@ def view_loaded(
             check_beside(loaded, other)
     ndc = photographs.ndc if loaded.model.scene.warped else None
     queue = RenderQueue(loaded, ndc=ndc, truth=photographs.truth, second=second, quick=quick)
-    server = open_server(host, port, "nerfloom")
+    server = open_server(host, port)
     page = Page(server, queue, photographs, commands)
     say("Ctrl-C ends it")
     seen, looked = loaded.checkpoint, time.monotonic()

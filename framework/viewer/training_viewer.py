@@ -106,9 +106,6 @@ def in_training(run: Run, trainer: Trainer) -> Loaded:
 def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
     """Serve a run in training to browsers, within a `with` block.
 
-    Args:
-        trainer: the run's trainer.
-
     Yields:
         Function to be called between steps.
 
@@ -120,7 +117,7 @@ def training_viewer(run: Run, trainer: Trainer) -> Iterator[BetweenSteps]:
     ndc = cameras.ndc if isinstance(cameras, NdcCameras) else None
     queue = RenderQueue(in_training(run, trainer), PIECE_SECONDS, PIECE_SECONDS, ndc, photographs.truth)
     turns = Turns(trainer, queue, config.viewer_share)
-    server = open_server(config.viewer.websocket_host, config.viewer.websocket_port, "nerfloom")
+    server = open_server(config.viewer.websocket_host, config.viewer.websocket_port)
     page = Page(server, queue, photographs, commands=None)
     status = Status(server, page, trainer, turns)
 

@@ -187,7 +187,7 @@ def test_blocks_can_be_looked_at_before_they_are_trained(tmp_path: Path) -> None
         (("--overlap", 1), 2, "--overlap is 1"),
         (("--block-size", 0), 2, "--block-size is 0"),
         (("--min-cameras", 20, "--max-cameras", 10), 2, "--max-cameras 10"),
-        (("--method", ""), 2, "--method is empty"),
+        (("--method", ""), 2, "--method: '' names no method"),
         (("--method", "nerfactor"), 1, "Did you mean 'nerfacto'"),
         (("--data", "/no/such/folder"), 1, "there is no such folder"),
         (("--method", "nerfacto --max-train-images 3"), 2, "leave out --train-image-indices and --max-train-images"),

@@ -37,7 +37,7 @@ def test_labels_that_differ_have_folders_that_differ() -> None:
 
 @pytest.mark.parametrize(
     ("text", "reason"),
-    [("", "an empty name"), ("kplane", "Did you mean 'kplanes'"), ('kplanes "open', "is invalid: No closing")],
+    [("", "names no method"), ("kplane", "Did you mean 'kplanes'"), ('kplanes "open', "is invalid: No closing")],
 )
 def test_what_is_no_contender(text: str, reason: str) -> None:
     with pytest.raises(ConfigError, match=reason):

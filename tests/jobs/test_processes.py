@@ -108,7 +108,7 @@ def test_flags_choose_the_launcher(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         with pytest.raises(FlagError, match=reason):
             flags.chosen_launcher(tmp_path)
     monkeypatch.setattr("nerfloom.base.extras.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match="--launcher ray needs a package that is not installed: pip install ray"):
+    with pytest.raises(ConfigError, match="--launcher ray needs packages that are not installed: pip install ray"):
         JobFlags(launcher="ray").chosen_launcher(tmp_path).run([])
 
 

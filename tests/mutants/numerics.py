@@ -412,7 +412,7 @@ MUTANTS = {
     "nerfloom.rendering.volume": [
         Mutant("depth-not-normalised", "mean_distance", "A / torch.where(visible, opacity, torch.ones_like(A))", "A",
             "depth of what is not opaque comes out nearer", "kernels/test_compositing.py::test_slab"),
-        Mutant("directions-of-other-rays", "sample_values", "rays.directions.index_select(0, A)",
+        Mutant("directions-of-other-rays", "VolumeRenderer.values", "rays.directions.index_select(0, A)",
             "rays.directions.index_select(0, A.flip(0))",
             "colours are seen from another ray's direction",
             "rendering/test_volume.py::test_each_sample_has_the_camera_of_its_ray_and_is_seen_along_it"),

@@ -103,7 +103,7 @@ class Checker:
         elif name == "pip":
             check_extras(rest)
         elif words[1:3] == ["-m", "benchmarks"]:
-            assert status_of(import_module("benchmarks.__main__")._command, words[3:]) in (0, None)
+            assert status_of(import_module("benchmarks.__main__").main.__wrapped__, words[3:]) in (0, None)
         elif name in ("python", "python3"):
             check_python(rest)
         else:
@@ -114,7 +114,7 @@ class Checker:
         assert name in scripts, f"pyproject.toml has no command {name}"
         if rest[:1] == ["--version"]:
             return
-        status = status_of(import_module(scripts[name])._command, rest)
+        status = status_of(import_module(scripts[name]).main.__wrapped__, rest)
         assert status in (0, None), "it does not understand its flags"
         begun_without_working = (
             status is None or rest[-1] in ("--help", "--help-all") or name in ("ns-new-method", "ns-stress")

@@ -97,9 +97,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory, shared_tiny: Path) -> Path:
 def execute(words: list[str]) -> None:
     scripts = dict(re.findall(r'^(ns-[\w-]+) = "(.+):main"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))
     if words[:3] == ["python", "-m", "benchmarks"]:
-        ours._command(words[3:])
+        ours.main.__wrapped__(words[3:])
         return
-    import_module(scripts[words[0]])._command(words[1:])
+    import_module(scripts[words[0]]).main.__wrapped__(words[1:])
 
 
 def in_small(command: str) -> list[str]:

@@ -193,9 +193,9 @@ def test_regularisers_of_planes_in_space_and_time(backend: str, moving_planes: K
         planes.table.copy_(torch.rand(planes.table.shape, generator=torch.Generator().manual_seed(0)) * 2)
     exact = planes.table.detach().double().requires_grad_()
     truth = variation_by_torch(exact, planes.layout)
-    turns = [PlaneRegularity().of(moving_planes.field, torch.zeros(()), turn) for turn in range(6)]
+    turns = [PlaneRegularity("planes").of(moving_planes.field, torch.zeros(()), turn) for turn in range(6)]
     found = [torch.stack(values).mean() for values in zip(*turns, strict=True)]
-    at_once = PlaneRegularity().of(moving_planes.field, torch.zeros(()), None)
+    at_once = PlaneRegularity("planes").of(moving_planes.field, torch.zeros(()), None)
     for value, all_planes, expected in zip(found, at_once, truth, strict=True):
         assert value.item() == pytest.approx(expected.item(), rel=1e-5)
         assert all_planes.item() == pytest.approx(expected.item(), rel=1e-5)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from nerfloom.fields.base import Field
+from nerfloom.geometry.bounds import half_edge
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays
 from nerfloom.kernels.histograms.intervals import resample
@@ -17,7 +18,7 @@ from nerfloom.kernels.histograms.spacing import spacing
 from nerfloom.kernels.march.occupancy import Occupancy
 from nerfloom.kernels.march.waves import CompiledMarch, ReferenceMarch
 from nerfloom.rendering.volume import VolumeRenderer
-from nerfloom.samplers.proposal import ENDLESS_FAR, ProposalSampler, half_edge, interlevel_loss
+from nerfloom.samplers.proposal import ENDLESS_FAR, ProposalSampler, interlevel_loss
 from tests.kernels.test_march import walk
 from tests.stress.backends import COMPILED, FEW, backends
 

@@ -209,14 +209,14 @@ def test_on_somebodys_data(
         (("instant-ngp", "--output-path", "table.md"), "--output-path table.md: it must end in .json"),
         (("instant-ngp", "kplanez"), "unknown method 'kplanez'. Did you mean 'kplanes'"),
         (("--data",), "the methods come first, before --data"),
-        (("",), "the method is missing"),
+        (("",), "METHOD: '' names no method"),
     ],
 )
 def test_what_cannot_be_begun_is_one_line(
     arguments: tuple[object, ...], words: str, refused: Refused, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    flags = {"--only", "--max-num-iterations", "--output-path"}
+    flags = {"", "--only", "--max-num-iterations", "--output-path"}
     assert words in refused(main, *arguments, status=2 if flags & set(arguments) else 1)
     assert list(tmp_path.iterdir()) == []
 

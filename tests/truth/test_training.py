@@ -21,10 +21,11 @@ from nerfloom.evaluation.evaluator import evaluate
 from nerfloom.fields.base import Field
 from nerfloom.geometry.points import Points
 from nerfloom.geometry.rays import Rays, Samples
+from nerfloom.kernels.math import scale_gradient
 from nerfloom.losses.term import RenderedBatch
 from nerfloom.losses.terms import Distortion
 from nerfloom.registry import load_method
-from nerfloom.rendering.volume import sample_values, volume_render
+from nerfloom.rendering.volume import VolumeRenderer, volume_render
 from nerfloom.samplers.choice import SamplingConfig, make_sampler
 from nerfloom.samplers.occupancy import OccupancySampler
 from nerfloom.training.checkpoint import load_checkpoint
@@ -340,15 +341,21 @@ def test_what_is_near_a_camera_learns_little(
 ) -> None:
     """Gradients are scaled by the squared distance, in half edges of the box, and by 1 beyond one of them."""
     trainer = captured(shared_tiny, tmp_path, {"unbounded": True, "near": 0.05})
-    given: list[tuple[Samples, Tensor]] = []
+    shown, given, values = list[Samples](), list[Tensor](), VolumeRenderer.values
 
-    def noted(rays: Rays, samples: Samples, field: Field, factors: Tensor, thin: float) -> tuple[Tensor, Tensor]:
-        given.append((samples, factors))
-        return sample_values(rays, samples, field, factors, thin)
+    def shaded(self: VolumeRenderer, rays: Rays, samples: Samples, field: Field) -> tuple[Tensor, Tensor]:
+        shown.append(samples)
+        return values(self, rays, samples, field)
 
-    monkeypatch.setattr("nerfloom.rendering.volume.sample_values", noted)
+    def noted(values: Tensor, factors: Tensor) -> Tensor:
+        given.append(factors)
+        return scale_gradient(values, factors)
+
+    monkeypatch.setattr(VolumeRenderer, "values", shaded)
+    monkeypatch.setattr("nerfloom.rendering.volume.scale_gradient", noted)
     trainer.train_step()
-    ((samples, factors),) = given
+    (samples,), (factors, of_colors) = shown, given
+    assert of_colors is factors
     half = float((trainer.model.scene.box[1] - trainer.model.scene.box[0])[0]) / 2
     torch.testing.assert_close(factors, (samples.t / half).square().clamp(max=1))
     assert factors.min() < 0.1

@@ -50,7 +50,7 @@ class Served:
         self.photographs = Photographs(run, lambda: trainer.model)
         self.queue = RenderQueue(in_training(run, trainer), truth=self.photographs.truth)
         self.folder, self.data, self.model = folder, data, trainer.model
-        self._server = open_server("127.0.0.1", 17007, "test")
+        self._server = open_server("127.0.0.1", 17007)
         self.port = self._server.get_port()
         self.page = Page(self._server, self.queue, self.photographs, commands=None)
         self._ending = False

@@ -39,6 +39,8 @@ PICTURES_SHARE = 0.45
 """Share of the budget for rendering pictures; the rest is for training steps."""
 FIELD_SHARE = 0.5
 """Share of the field's steps beside those of photographs. It does not fall: Gaussians have to look like the field."""
+UNSEEN_EVERY = 4
+"""Every Nth picture is from an unseen pose, the others from training cameras."""
 MAX_GAUSSIANS, MAX_RATE = 300_000, 5.0
 """Maximum number of Gaussians, and factor of learning rates, that are chosen by the budget."""
 STEPS_PER_SECOND = 25
@@ -103,7 +105,7 @@ def fit_gaussians(
     dataset = replace(dataset, scene=replace(dataset.scene, num_scenes=1), depths=None, sparse_depth=None)
     drawable = replace(dataset, cameras=cameras)
     background = training_background("auto", dataset.scene)
-    pictures = TaughtViews(model.render_view, drawable, background, machine.seed)
+    pictures = TaughtViews(model.render_view, drawable, background, machine.seed, UNSEEN_EVERY)
     pictures.render_ahead(PICTURES_SHARE * seconds)
     exact = dataset.times is None and dataset.cameras.model in DRAWN and not dataset.scene.appearance_varies
     train_set, share, used = (dataset, FIELD_SHARE, len(dataset)) if exact else (drawable, 1.0, 0)

@@ -143,10 +143,14 @@ class TaughtViews(BatchSource):
         dataset: the training images; their cameras bound the visible space.
         background: background of transparent pixels, one colour for the whole picture.
         seed: seed of the run.
+        unseen_every: every Nth picture is from an unseen pose, and the others are from a training camera.
     """
 
-    def __init__(self, render: Render, dataset: Dataset, background: Background, seed: int) -> None:
+    def __init__(
+        self, render: Render, dataset: Dataset, background: Background, seed: int, unseen_every: int = 1
+    ) -> None:
         self.render, self.dataset, self.background, self.seed = render, dataset, background, seed
+        self.unseen_every = unseen_every
         sizes = torch.maximum(dataset.cameras.widths, dataset.cameras.heights)
         factor = min(1.0, MAX_SIDE / int(sizes.max()))
         self.cameras = dataset.cameras if factor == 1 else dataset.cameras.scaled(factor)
@@ -161,18 +165,21 @@ class TaughtViews(BatchSource):
         """Render pictures for about `seconds`, and draw from these alone.
 
         They are random parts of images, since small images have too little detail. MIN_PICTURES have half of an image's
-        width and height; by the time that they take, the others are as large as lets about PICTURES fit.
+        width and height; by the time that pixels take, the others are as large as lets PICTURES fit.
         """
-        start, whole = time.perf_counter(), max(map(max, self.cameras.sizes))
-        self.count, self.side = 0, round(whole / 2)
+        start, pixels = time.perf_counter(), 0
+        height, width = self.cameras.sizes[0]
+        self.count, self.side = 0, round(max(height, width) / 2)
         for percent in track(range(1, 101), "Rendering pictures", total=100):
             end = start + seconds * percent / 100
             while self.count < MIN_PICTURES or (self.count < MAX_PICTURES and time.perf_counter() < end):
-                self._picture(self.count)
+                pixels += self._picture(self.count)[1][..., 0].numel()
                 self.count += 1
-                if self.count == MIN_PICTURES:
-                    room = seconds / PICTURES / ((time.perf_counter() - start) / MIN_PICTURES)
-                    self.side = round(whole * min(max(math.sqrt(room) / 2, 0.5), 1.0))
+                if self.count >= MIN_PICTURES:
+                    spent = time.perf_counter() - start
+                    room = (seconds - spent) / max(PICTURES - self.count, 1) * pixels / spent
+                    share = math.sqrt(max(room, 0.0) / (height * width))
+                    self.side = round(max(height, width) * min(max(share, 0.5), 1.0))
 
     def draw(self, request: Request) -> ViewBatch:
         number = int(torch.randint(self.count, ()))
@@ -192,7 +199,9 @@ class TaughtViews(BatchSource):
             with torch.random.fork_rng(devices=[]):  # whether it is new must not change what is drawn after it
                 torch.default_generator.manual_seed(stream_seed(self.seed, number, PICTURE_STREAM))
                 near = self.order[[number % len(self.order)]]
-                camera, _ = random_part(unseen_cameras(self.cameras, near), self.side)
+                is_unseen = (number + 1) % self.unseen_every == 0
+                cameras = unseen_cameras(self.cameras, near) if is_unseen else self.cameras[near]
+                camera, _ = random_part(cameras, self.side)
                 view = View.of(camera, 0, None if times is None else times[near])
                 shown = self.render(view, torch.zeros(3, device=self.dataset.device))
             light, opacity = shown.rgb.clamp(0, 1).half(), shown.accumulation.clamp(0, 1).half()

@@ -281,6 +281,17 @@ def test_whole_pictures_are_rendered_once(monkeypatch: pytest.MonkeyPatch) -> No
         assert torch.equal(mine.view.camera.camera_to_worlds, theirs.view.camera.camera_to_worlds)
 
 
+def test_every_nth_picture_is_from_an_unseen_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(taught_file, "PICTURES", 8)
+    dataset = ball_in_a_box()
+    source = TaughtViews(octree_teacher(dataset)[2].picture, dataset, "white", seed=5, unseen_every=4)
+    poses = {tuple(drawn(source, 0, seed=n).view.camera.camera_to_worlds.flatten().tolist()) for n in range(100)}
+    known = set(map(tuple, dataset.cameras.camera_to_worlds.flatten(1).tolist()))
+    unseen = poses - known
+    assert len(unseen) == 2
+    assert 1 <= len(poses & known) <= 6  # each training camera once before any twice
+
+
 def test_large_pictures_are_reduced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(taught_file, "MAX_SIDE", 12)
     dataset = ball_in_a_box()

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import say, track
+from nerfloom.base.counts import counted
 from nerfloom.base.device import seed_step, wait_for
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.machine_config import MachineConfig
@@ -173,7 +174,7 @@ def fit_gaussians(
     take_all(trainer.steps(), "Fitting Gaussians")
     found, dropped = fitted.gaussians(), trainer.state.skipped
     without = f" ({dropped:,} dropped: gradients not finite)" if dropped else ""
-    say(f"{len(found):,} Gaussians after {trainer.state.step:,} steps{without}")
+    say(f"{counted(len(found), 'Gaussians')} after {counted(trainer.state.step, 'steps')}{without}")
     return found
 
 

@@ -18,7 +18,15 @@ from nerfloom.cameras.poses import Placement, estimate_near, held_out
 from nerfloom.data.dataset import existing_files
 from nerfloom.data.exposure import read_taken
 from nerfloom.data.image_files import image_size
-from nerfloom.data.names_on_disk import LIKELIEST, REDUCED, nearest_on_disk, reduced_folder
+from nerfloom.data.names_on_disk import (
+    LIKELIEST,
+    REDUCED,
+    are_files,
+    distinct_names,
+    files_in,
+    nearest_on_disk,
+    reduced_folder,
+)
 from nerfloom.dataparsers.placing import Applied, placement_of
 from nerfloom.dataparsers.posed_images import Captured, PosedImages, StatedRegion
 from nerfloom.dataparsers.region import distances
@@ -79,7 +87,7 @@ def captured_scene(
     near = min(estimate_near(cameras, sparse.sound), flags.far / 2) if flags.near is None else flags.near
     box = _box(flags, images.region, placement)
     shows_object = images.region is not None and images.masks is not None
-    images = images[chosen]
+    names, images = _names_of(images, chosen), images[chosen]
     _check_masks(images.masks)
     return ParsedScene(
         image_paths=images.paths,
@@ -101,7 +109,14 @@ def captured_scene(
         depth_paths=images.depths,
         object_distances=_object_distances(flags, cameras, box) if shows_object else None,
         taken=images.taken,
+        names=names,
     )
+
+
+def _names_of(images: PosedImages, chosen: Tensor) -> tuple[str, ...]:
+    """Return the names of the `chosen` (S,) images, with the folders that tell all `images` apart."""
+    names = distinct_names(images.paths)
+    return tuple(names[index] for index in chosen.tolist())
 
 
 def image_sizes(paths: Sequence[Path]) -> Tensor:
@@ -160,7 +175,8 @@ def _choose_files(images: PosedImages, factor: int | None, quiet: bool) -> tuple
     folder, paths = images.folder, images.paths
     root = _shared_folder(folder, paths)
     steps = sorted({*REDUCED, factor or 1})
-    counts = {step: sum(_reduced(path, root, step).is_file() for path in paths) for step in steps}
+    found = {step: _reduced(paths, root, step) for step in steps}
+    counts = {step: len(paths) - files.count(None) for step, files in found.items()}
     most = max(counts.values())
     if most == 0:
         return images, 1  # `existing_files` reports it
@@ -170,8 +186,7 @@ def _choose_files(images: PosedImages, factor: int | None, quiet: bool) -> tuple
         say(f"{root}: not all images have one reduced by {' and '.join(partial)} beside them; these are not used")
     if factor is None:
         factor = available[0]
-        files = [_reduced(path, root, factor) for path in paths]
-        side = max(image_size([path for path in files if path.is_file()])) * factor
+        side = max(image_size([path for path in found[factor] if path is not None])) * factor
         while side > MAX_SIDE * factor:
             factor *= 2
     fitting = [step for step in available if factor % step == 0]
@@ -183,7 +198,7 @@ def _choose_files(images: PosedImages, factor: int | None, quiet: bool) -> tuple
     step = fitting[-1]
     images = replace(
         images,
-        paths=tuple(_reduced(path, root, step) for path in paths),
+        paths=tuple(small or path for small, path in zip(found[step], _named(paths, root, step), strict=True)),
         masks=_beside(folder, images.masks, step),
         depths=_beside(folder, images.depths, step),
     )
@@ -197,25 +212,38 @@ def _shared_folder(folder: Path, paths: Sequence[Path]) -> Path | None:
     return folder / tops.pop() if len(tops) == 1 and ".." not in tops else None
 
 
-def _reduced(path: Path, root: Path | None, step: int) -> Path:
-    """Return the path of an image reduced by `step`: in a folder beside `root`, with the original's name."""
-    if step == 1:
-        return path
-    if root is None:
-        return path / "none"
+def _named(paths: Sequence[Path], root: Path | None, step: int) -> list[Path]:
+    """Return the paths of images reduced by `step` in a folder beside `root`, with the originals' names."""
+    if step == 1 or root is None:
+        return list(paths)
     folder = reduced_folder(root, step)
-    file = folder / path.relative_to(root)
-    alternatives = [file.with_suffix(ending) for ending in LIKELIEST if folder.is_dir()]
-    return next((alternative for alternative in (file, *alternatives) if alternative.is_file()), file)
+    return [folder / path.relative_to(root) for path in paths]
+
+
+def _reduced(paths: Sequence[Path], root: Path | None, step: int) -> list[Path | None]:
+    """Return the files of images reduced by `step`, whose names may have another ending; None for missing ones."""
+    if step == 1:
+        return [path if exists else None for path, exists in zip(paths, are_files(paths), strict=True)]
+    if root is None or not reduced_folder(root, step).is_dir():
+        return [None] * len(paths)
+    named = _named(paths, root, step)
+    listed = files_in(path.parent for path in named)
+    found: list[Path | None] = []
+    for path in named:
+        names = listed[path.parent]
+        tried = (path.name.lower(), *(f"{path.stem}{ending}".lower() for ending in LIKELIEST))
+        name = next((names[each] for each in tried if each in names), None)
+        found.append(None if name is None else path.with_name(name))
+    return found
 
 
 def _beside(folder: Path, paths: tuple[Path | None, ...] | None, step: int) -> tuple[Path | None, ...] | None:
     """Return the masks or depths for images reduced by `step`: reduced ones if they exist, otherwise the originals."""
     if paths is None:
         return None
-    root = _shared_folder(folder, [path for path in paths if path is not None])
-    reduced = [None if path is None else _reduced(path, root, step) for path in paths]
-    return tuple(small if small and small.is_file() else path for small, path in zip(reduced, paths, strict=True))
+    given = [path for path in paths if path is not None]
+    reduced = iter(_reduced(given, _shared_folder(folder, given), step))
+    return tuple(path and (next(reduced) or path) for path in paths)
 
 
 def _with_mask(images: PosedImages, split: Split) -> Tensor:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from nerfloom import DataError
+from nerfloom.base.lfs import ADVICE, is_pointer
 
 MAX_NAME_LENGTH = 4096
 """Maximum length of an image's name, bytes; no system opens longer paths."""
@@ -49,6 +50,8 @@ def check_text(folder: Path) -> None:
     for file in (folder / f"{name}.txt" for name in RECORDS):
         if not file.is_file():
             continue
+        if is_pointer(file):
+            raise DataError(f"{file} cannot be read: {ADVICE}")
         with file.open("rb") as opened:
             if opened.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8:
                 raise DataError(
@@ -113,6 +116,8 @@ def _is_number(word: str) -> bool:
 
 
 def _check_file(file: Path, walk: Walk, records: str) -> None:
+    if is_pointer(file):
+        raise DataError(f"{file} cannot be read: {ADVICE}")
     advice = "copy it again, or export the model again with `colmap model_converter`"
     try:
         if file.stat().st_size < 8:

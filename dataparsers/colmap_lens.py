@@ -33,8 +33,8 @@ def lenses_of(cameras: Sequence[SparseCamera], names: Sequence[str], where: str)
     for row, current in enumerate(converted):
         if current.model not in (model, "pinhole") or (model == "fisheye" and current.model == "pinhole"):
             raise DataError(
-                f"{where}: image {names[row]!r} has a {current.model} camera and image "
-                f"{names[models.index(model)]!r} a {model} one; convert the images to one model: {_command(where)}"
+                f"{where}: image {names[row]!r} has a camera of the model {current.model}, and image "
+                f"{names[models.index(model)]!r} one of {model}; convert the images to one model: {_command(where)}"
             )
         lens[row, : len(current.lens)] = torch.tensor(current.lens)
     intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in converted], dtype=torch.float64)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerfloom import DataError
 from nerfloom.base.console import say
-from nerfloom.base.errors import nearest, shown
+from nerfloom.base.errors import shown
 from nerfloom.base.json_files import number
 from nerfloom.dataparsers.captured import sizes_of
 from nerfloom.dataparsers.posed_images import Lenses
@@ -103,7 +103,7 @@ def _camera_model(file: Path, content: dict[str, Any], frames: Frames) -> tuple[
     given = [_value(frame, content, "camera_model") or "PERSPECTIVE" for frame, _ in frames]
     named = {name if isinstance(name, str) else shown(name) for name in given}
     for name in sorted(named - set(CAMERA_MODELS)):
-        raise DataError(f"{file}: unknown camera_model '{shown(name)[1:-1]}'. {nearest(name, CAMERA_MODELS)}")
+        raise DataError(f"{file}: unknown camera_model '{shown(name)[1:-1]}'; known: {', '.join(CAMERA_MODELS)}")
     models = {CAMERA_MODELS[name] for name in named}
     if len(models) > 1:
         raise DataError(f"{file} mixes the camera models {' and '.join(sorted(named))}; split it into a file for each")

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from nerfloom.data.folders import walk
 from nerfloom.data.names_on_disk import without_ending
 from nerfloom.data.suffixes import IMAGE_SUFFIXES
 
@@ -16,9 +17,8 @@ LAST_NUMBER = re.compile(r"(\d{1,18})\D*$")
 
 def image_names(folder: Path) -> list[str]:
     """Return the sorted names of the images in `folder`; none if it is not a folder."""
-    if not folder.is_dir():
-        return []
-    return sorted(file.name for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file())
+    names = next(walk(folder), (folder, list[str]()))[1]
+    return [name for name in names if name.lower().endswith(IMAGE_SUFFIXES) and (folder / name).is_file()]
 
 
 def last_number(name: str) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -55,7 +56,7 @@ def load(
     """
     if up not in (None, *get_args(Axis)):
         raise ConfigError(f"up is {shown(up)}; it must be one of {', '.join(get_args(Axis))}")
-    found = config_file(Path(path))
+    found = config_file(_at_home(path))
     return Opened.of(loaded(found, _path(checkpoint), device, _path(data), up=up))
 
 
@@ -79,11 +80,12 @@ def process(photographs: str | Path, output_dir: str | Path, kind: str = "images
 
     if kind not in KINDS:
         raise ConfigError(f"unknown kind '{kind}'. {nearest(kind, list(KINDS))}")
-    kind, data = kind_of(kind, Path(photographs))
+    kind, data = kind_of(kind, _at_home(photographs))
     flags = KINDS[kind].flags
-    given = {**settings, "data": data, "output_dir": Path(output_dir)}
+    output = _at_home(output_dir)
+    given = {**settings, "data": data, "output_dir": output}
     processed(kind, flags(**arguments_of(flags, given, "process()")))
-    return Path(output_dir)
+    return output
 
 
 def train(method: str, data: str | Path | None = None, format: str | None = None, **settings: Any) -> Opened:
@@ -113,7 +115,11 @@ def train(method: str, data: str | Path | None = None, format: str | None = None
 
 
 def _path(given: str | Path | None) -> Path | None:
-    return None if given is None else Path(given)
+    return None if given is None else _at_home(given)
+
+
+def _at_home(given: str | Path) -> Path:
+    return Path(os.path.expanduser(given))
 
 
 def _text(path: Path | None) -> str | None:

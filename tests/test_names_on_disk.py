@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nerfloom.data.names_on_disk import distinct_names, files_below, match_names, nearest_on_disk, on_disk
+from nerfloom.data.names_on_disk import are_files, distinct_names, files_below, match_names, nearest_on_disk, on_disk
 
 
 def make(folder: Path, *files: str) -> Path:
@@ -147,3 +147,12 @@ def test_the_nearest_thing_is_named(tmp_path: Path) -> None:
         (tmp_path / link).symlink_to("/moved/away")
         expected = f"{tmp_path / link} is a link to /moved/away, which does not exist"
         assert nearest_on_disk(tmp_path / missing) == expected
+
+
+def test_files_of_many_names_are_told_with_one_look_at_each_folder(tmp_path: Path) -> None:
+    make(tmp_path, "a/1.jpg", "b/2.jpg")
+    (tmp_path / "a" / "linked.jpg").symlink_to(tmp_path / "b" / "2.jpg")
+    (tmp_path / "a" / "broken.jpg").symlink_to(tmp_path / "gone.jpg")
+    names = ["a/1.jpg", "a/2.jpg", "a/linked.jpg", "a/broken.jpg", "b", "none/1.jpg"]
+    paths = [tmp_path / name for name in names]
+    assert are_files(paths) == [path.is_file() for path in paths] == [True, False, True, False, False, False]

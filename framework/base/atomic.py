@@ -9,6 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
+MAX_START = 200
+"""Maximum number of bytes of a file's name in that of its temporary file; systems allow 255 in all."""
+
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object], flush: bool = True) -> None:
     """Call `write(file)` on a temporary binary file beside `path`, flush it to disk and rename it.
@@ -21,7 +24,8 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object], flush: boo
     Raises:
         OSError: if the file cannot be written; `path` is then unchanged, and no temporary file is left.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_native_id()}.tmp")
+    start = os.fsencode(path.name)[:MAX_START].decode(errors="ignore")
+    temporary = path.with_name(f".{start}.{os.getpid()}.{threading.get_native_id()}.tmp")
     try:
         with temporary.open("wb") as file:
             write(file)

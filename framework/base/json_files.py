@@ -9,6 +9,7 @@ from typing import Any
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import DataError, shown
+from nerfloom.base.lfs import ADVICE, is_pointer
 
 
 def read_json(file: Path) -> Any:
@@ -22,7 +23,7 @@ def read_json(file: Path) -> Any:
     except OSError as error:
         raise DataError(f"cannot read {file}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{file} is not JSON: {error}") from error
+        raise DataError(f"{file} is not JSON: {ADVICE if is_pointer(file) else error}") from error
 
 
 def read_object(file: Path) -> dict[str, Any]:

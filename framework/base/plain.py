@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import types
 import typing
 from pathlib import Path
@@ -90,7 +91,7 @@ def converted(value: Any, hint: Any, where: str) -> Any:
         if len(inner) == len(value):
             return tuple(converted(item, kind, where) for item, kind in zip(value, inner, strict=True))
     if hint is Path and isinstance(value, str) and "\0" not in value:
-        return Path(value)
+        return Path(os.path.expanduser(value))
     if hint is float and isinstance(value, (str, int, float)) and not isinstance(value, bool):
         try:
             return float(value)  # YAML 1.1 reads 1e-3 as a string

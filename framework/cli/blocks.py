@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import entry_point
 from nerfloom.cli.flags import read_flags
@@ -159,7 +160,7 @@ def split(flags: BlocksFlags, parsed: ParsedScene) -> tuple[Block, ...]:
         blocks = grid_blocks(positions, flags.block_size, flags.overlap, least)
     for number, block in enumerate(blocks):
         place = ", ".join(f"{value:.6g}" for value in block.center)
-        say(f"block {number:03d}: {len(block.cameras)} images around ({place}), radius {block.radius:.4g}")
+        say(f"block {number:03d}: {counted(len(block.cameras), 'images')} around ({place}), radius {block.radius:.4g}")
     if left := in_no_block(blocks, len(positions)):
         names = ", ".join(parsed.image_paths[index].name for index in left[:NAMED])
         more = ", ..." if len(left) > NAMED else ""

@@ -187,7 +187,7 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     argument `--debug` shows the traceback. After a signal the status is 128 plus the signal's number. `--version`
     prints the version, and with `--environment` also the details for error reports.
     """
-    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    arguments = [_from_home(argument) for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     if "--version" in (*arguments[:1], *arguments[-1:]):
         print(_environment() if "--environment" in arguments else version())
@@ -216,6 +216,12 @@ def run_command(command: Callable[[list[str]], None]) -> None:
     except KeyboardInterrupt as stop:
         say(str(stop) or "interrupted")
         sys.exit(exit_status(stop))
+
+
+def _from_home(argument: str) -> str:
+    """Return an argument with the home folder for "~" at the beginning of a value: most shells leave --data=~/x."""
+    flag, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
+    return f"{flag}{equals}{os.path.expanduser(value)}"
 
 
 def version() -> str:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.cli.common import entry_point, make_room, with_format, with_run
 from nerfloom.cli.flags import read_flags
@@ -124,7 +125,7 @@ def main(arguments: list[str]) -> None:
 
     loaded = load(found, flags.load_checkpoint, flags.device_type, flags.data, data_format=named)
     edited = take_steps(Edited.of(loaded, flags.time), steps, HeldOut.of(loaded, flags.max_images))
-    say(f"{len(edited):,} Gaussians are written")
+    say(f"written: {counted(len(edited), 'Gaussians')}")
     for sentence in edited.write(flags.output_path, flags.max_megabytes, flags.spz_version):
         say(sentence)
     if flags.save_recipe is not None:

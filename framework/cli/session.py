@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.base.device import choose_device, peak_memory
 from nerfloom.base.errors import LostProcessError
 from nerfloom.base.extras import require
@@ -156,7 +157,7 @@ def _finish(run: Run, trainer: Trainer) -> None:
         f"{outcome.reason}: step {state.step:,}, {state.seconds:.1f} s of training, "
         f"{state.rays / max(state.seconds, 1e-9) / 1e3:.1f}k rays/s, "
         f"{peak_memory(trainer.device) / 2**30:.2f} GiB at most"
-        + (f", {state.skipped} steps skipped as not finite" if state.skipped else "")
+        + (f", {counted(state.skipped, 'steps')} skipped as not finite" if state.skipped else "")
     )
     rungs = skip_report(trainer)
     for line in lines(rungs):
@@ -183,7 +184,7 @@ def _count(model: HasGaussians) -> str:
     """Return a line with the number of Gaussians, and of the ones that are not finite and never drawn."""
     gaussians = model.gaussians()
     bad = len(gaussians) - int(gaussians.finite().sum())
-    return f"{len(gaussians):,} Gaussians" + (f", {bad:,} of them not finite and never drawn" if bad else "")
+    return counted(len(gaussians), "Gaussians") + (f", {bad:,} of them not finite and never drawn" if bad else "")
 
 
 def _evaluate(run: Run, trainer: Trainer, outcome: Outcome) -> None:

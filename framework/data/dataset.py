@@ -26,7 +26,7 @@ from nerfloom.data.diffuse_light import read_diffuse
 from nerfloom.data.exposure import devices_of, exposures_of, read_taken
 from nerfloom.data.light_spread import APPEARANCE_STOPS, light_spread
 from nerfloom.data.motion_bound import MotionBound
-from nerfloom.data.names_on_disk import distinct_names, nearest_on_disk
+from nerfloom.data.names_on_disk import are_files, distinct_names, nearest_on_disk
 from nerfloom.data.normals import read_normals
 from nerfloom.data.parsed_scene import ParsedScene
 from nerfloom.data.pixels.cache import PixelMemory
@@ -86,6 +86,8 @@ class Dataset:
     """M files of true normals, read when asked for; None if there are none."""
     light_paths: tuple[Path | None, ...] | None = None
     """M files of true diffuse light, read when asked for; None if there are none."""
+    given_names: tuple[str, ...] | None = None
+    """M names of the images in the whole data, of which these may be a part; None if `paths` are all."""
     motion_bound: MotionBound | None = None
     """Distance that matter may move, on the CPU, estimated from the images; None if unknown or not needed."""
 
@@ -94,8 +96,8 @@ class Dataset:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """M file names, with as many folders as distinguish all files."""
-        return distinct_names(self.paths)
+        """M file names, with as many folders as distinguish all files of the data."""
+        return distinct_names(self.paths) if self.given_names is None else self.given_names
 
     @property
     def placement(self) -> Placement:
@@ -220,7 +222,8 @@ def existing_files(paths: Sequence[Path], split: str) -> Tensor:
     Raises:
         DataError: if no file exists.
     """
-    missing = [path for path in paths if not path.is_file()]
+    there = are_files(paths)
+    missing = [path for path, exists in zip(paths, there, strict=True) if not exists]
     if len(missing) == len(paths):
         first = f"; the first is {missing[0]}: {nearest_on_disk(missing[0])}" if missing else ""
         raise DataError(
@@ -228,7 +231,7 @@ def existing_files(paths: Sequence[Path], split: str) -> Tensor:
         )
     if missing:
         say(f"split '{split}': {len(missing)} of {len(paths)} images are missing and skipped, the first {missing[0]}")
-    return torch.tensor([index for index, path in enumerate(paths) if path.is_file()])
+    return torch.tensor([index for index, exists in enumerate(there) if exists])
 
 
 def load_dataset(
@@ -337,6 +340,7 @@ def assemble(parsed: ParsedScene, decoded: Decoded, split: str, masks: Masks = "
         training=split == "train",
         normal_paths=parsed.normal_paths,
         light_paths=parsed.light_paths,
+        given_names=parsed.names,
     )
 
 

@@ -6,12 +6,15 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+NOT_THE_USERS = {"@eadir", "@recycle", "#recycle", "$recycle.bin", "__macosx", "thumbs.db", "desktop.ini"}
+"""Names, in lower case, of what servers and systems put beside the user's files: thumbnails, deleted files, icons."""
+
 
 def walk(folder: Path) -> Iterator[tuple[Path, list[str]]]:
     """Yield `folder` and the folders below it, each with the sorted names of its files. Never raises.
 
     Links to folders are followed, since many data sets are linked and not copied. No folder is entered twice, so a
-    circle of links ends. Hidden files and folders are skipped.
+    circle of links ends. Hidden files and folders, and those of `NOT_THE_USERS`, are skipped.
     """
     entered: set[str] = set()
     for place, folders, names in os.walk(folder, followlinks=True):
@@ -20,5 +23,9 @@ def walk(folder: Path) -> Iterator[tuple[Path, list[str]]]:
             folders.clear()
             continue
         entered.add(real)
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        yield Path(place), sorted(name for name in names if not name.startswith("."))
+        folders[:] = _of_the_user(folders)
+        yield Path(place), _of_the_user(names)
+
+
+def _of_the_user(names: list[str]) -> list[str]:
+    return sorted(name for name in names if not name.startswith(".") and name.lower() not in NOT_THE_USERS)

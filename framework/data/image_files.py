@@ -13,6 +13,7 @@ from PIL import EpsImagePlugin, Image, UnidentifiedImageError, features
 
 from nerfloom.base.errors import DataError
 from nerfloom.base.extras import install_command
+from nerfloom.base.lfs import ADVICE, is_pointer
 from nerfloom.data.suffixes import HEIF_SUFFIXES, UNREAD_SUFFIXES
 
 # Pillow detects the format from the content, not from the name, and would run Ghostscript, an interpreter, for EPS.
@@ -151,6 +152,8 @@ def unreadable(path: Path, error: BaseException, what: str = "") -> DataError:
         reason = str(error)
     elif size == 0:
         reason = "the file is empty; copy it again"
+    elif is_pointer(path):
+        reason = ADVICE
     elif unidentified and path.suffix.lower() in HEIF_SUFFIXES and (command := install_command("heic")):
         reason = f"HEIC needs another package: {command}"
     elif unidentified and path.suffix.lower() == ".avif" and not features.check("avif"):

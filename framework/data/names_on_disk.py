@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import os
 import posixpath
+import re
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -28,8 +29,11 @@ REDUCED = (1, 2, 4, 8)
 """Factors of images reduced in advance; `images_2` holds images reduced by 2."""
 MAX_FILES = 200_000
 """Maximum number of files below a folder that are searched."""
-COMPANIONS = ("mask", "depth", "normal", "semantic", "segment", "label", "confidence", "thumb")
-"""Beginnings of names of folders with files that accompany images under the same names, in lower case."""
+COMPANIONS = re.compile(
+    r"(mask|depth|normal|semantic|segment(ation)?|label|confidence|thumb(nail)?)s?([ _-]?(map|image)s?)?(_\d+)?",
+    re.IGNORECASE,
+)
+"""Names of folders with files that accompany images under the same names, such as masks_2."""
 MAX_FOLDERS = 100
 """Maximum number of folders searched for one image."""
 MAX_NAMED = 3
@@ -136,6 +140,34 @@ def files_below(folder: Path, endings: Sequence[str] = IMAGE_SUFFIXES) -> list[s
 def reduced_folder(folder: Path, factor: int) -> Path:
     """Return the folder of images reduced by a `factor`: beside the `folder` of the originals, such as images_2."""
     return folder if factor == 1 else folder.with_name(f"{folder.name}_{factor}")
+
+
+def files_in(folders: Iterable[Path]) -> dict[Path, dict[str, str]]:
+    """Return the names of the files in each of `folders` by their lower-case form. Never raises.
+
+    Reading a folder once is much faster than asking for each of many files.
+    """
+    return {folder: {name.lower(): name for name in _names_in(folder)} for folder in set(folders)}
+
+
+def are_files(paths: Sequence[Path]) -> list[bool]:
+    """Return for each of `paths` whether it is a file."""
+    listed = {folder: set(_names_in(folder)) for folder in {path.parent for path in paths}}
+    # A name in another case is the same file for some systems.
+    return [path.name in listed[path.parent] or path.is_file() for path in paths]
+
+
+def _names_in(folder: Path) -> list[str]:
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(entry.name for entry in entries if entry.is_file())
+    except OSError:
+        return []
+
+
+def accompanies(folders: Iterable[str]) -> bool:
+    """Return whether a file in these nested `folders` accompanies an image, as a mask does, by one of their names."""
+    return any(COMPANIONS.fullmatch(folder) for folder in folders)
 
 
 def distinct_names(paths: Sequence[Path]) -> tuple[str, ...]:
@@ -264,7 +296,7 @@ def _moved(names: Sequence[str], files: Sequence[str], key: Callable[[str], str]
         votes.update(
             ("/".join(parts[:-length]), "/".join(there[:-length]))
             for length, there in shared
-            if length == longest and not any(part.startswith(COMPANIONS) for part in there[:-length])
+            if length == longest and not accompanies(there[:-length])
         )
     most = max(votes.values(), default=0)
     best = sorted((-there.split("/").count("images"), cut, there) for (cut, there), n in votes.items() if n == most)

@@ -75,6 +75,8 @@ class ParsedScene:
     """(M,) bool, source images, which a method may render others from; they are not evaluated. None without."""
     taken: tuple[Taken, ...] | None = None
     """How each image was taken, its exposure and device; None to read it from the images' EXIF."""
+    names: tuple[str, ...] | None = None
+    """M names that distinguish the images of all splits; None if `image_paths` distinguish those of this split."""
 
     @property
     def placement(self) -> Placement:
@@ -107,6 +109,7 @@ class ParsedScene:
             scene_indices=None if self.scene_indices is None else self.scene_indices[index],
             source_images=None if self.source_images is None else self.source_images[index],
             taken=None if self.taken is None else tuple(self.taken[i] for i in chosen),
+            names=None if self.names is None else tuple(self.names[i] for i in chosen),
         )
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import say
 from nerfloom.base.errors import DataError
+from nerfloom.base.lfs import ADVICE, is_pointer
 from nerfloom.geometry.local_origin import local_origin, rounding
 
 TYPES = {
@@ -149,7 +150,8 @@ def _opened(file: Path) -> Iterator[BinaryIO]:
 
 def _header(stream: BinaryIO, file: Path) -> PlyHeader:
     if stream.readline(MAX_LINE_LENGTH).strip() != b"ply":
-        raise DataError(f"{file} is not a PLY file: its first line is not 'ply'")
+        reason = ADVICE if is_pointer(file) else "its first line is not 'ply'"
+        raise DataError(f"{file} is not a PLY file: {reason}")
     order, comments = "", []
     described: list[tuple[str, int, list[tuple[str, str]]]] = []
     for _ in range(MAX_HEADER_LENGTH):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import ConfigError
 from nerfloom.edit.edited import Edited
 from nerfloom.edit.held_out import HeldOut
@@ -43,11 +44,11 @@ def _change(before: Edited, after: Edited) -> str:
     """Return a description of a step's effect."""
     count, left = len(before), len(after)
     if left > count:
-        return f"adds {left - count:,} to {count:,} Gaussians"
+        return f"adds {left - count:,} to {counted(count, 'Gaussians')}"
     if left < count:
-        return f"removes {count - left:,} of {count:,} Gaussians"
+        return f"removes {count - left:,} of {counted(count, 'Gaussians')}"
     if after.gaussians.degree < before.gaussians.degree:
         return f"harmonics up to degree {after.gaussians.degree} of {before.gaussians.degree}"
     if after.placement is not before.placement:
-        return f"moves {count:,} Gaussians"
-    return f"removes none of {count:,} Gaussians"
+        return f"moves {counted(count, 'Gaussians')}"
+    return f"removes none of {counted(count, 'Gaussians')}"

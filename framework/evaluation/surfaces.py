@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from nerfloom.base.console import track
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import DataError
 from nerfloom.cameras.poses import Placement
 from nerfloom.geometry.records import TensorRows
@@ -52,7 +53,7 @@ class Surface:
     def describe(self) -> str:
         """Return a description of its size, as text."""
         if self.faces is None:
-            return f"{len(self.points):,} points" + ("" if self.normals is None else " with normals")
+            return counted(len(self.points), "points") + ("" if self.normals is None else " with normals")
         return f"{len(self.faces):,} faces, {len(self.points):,} vertices"
 
     def at(self, faces: Tensor, weights: Tensor) -> Samples:

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.console import track
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.view import View
 from nerfloom.export.page_scenes import ScenePage
@@ -81,8 +82,8 @@ def levels_page(loaded: Loaded, path: Path, facts: PageFacts, turn: Tensor) -> S
     }
     text = page(content, replace(facts, look=file.look, levels=levels))
     words = (
-        f"{file.num_gaussians:,} Gaussians in {len(file.nodes):,} chunks of all levels, {size / 1e6:.1f} MB in the "
-        f"folder {folder.name} beside it"
+        f"{counted(file.num_gaussians, 'Gaussians')} in {counted(len(file.nodes), 'chunks')} of all levels, "
+        f"{size / 1e6:.1f} MB in the folder {folder.name} beside it"
     )
     costs = [f"{len(lossy):,} of the chunks lose more than others, the first: {lossy[0]}"] if lossy else []
     return ScenePage(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.cameras import Cameras
 from nerfloom.cameras.view import View
@@ -74,7 +75,7 @@ def gaussian_page(
     def draw(camera: Cameras) -> Tensor:
         return draw_colors(back, splat_camera(camera, facts.near, look), 1, model.background)
 
-    return ScenePage(text, f"{len(found):,} Gaussians of degree {found.degree}", costs, draw, DRAWN)
+    return ScenePage(text, f"{counted(len(found), 'Gaussians')} of degree {found.degree}", costs, draw, DRAWN)
 
 
 def octree_page(

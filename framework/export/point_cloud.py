@@ -9,6 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from nerfloom.base.console import say, track
+from nerfloom.base.counts import counted
 from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError, FlagError
 from nerfloom.base.extras import require
@@ -102,4 +103,4 @@ def export_points(loaded: Loaded, path: Path, settings: PointSettings, regions: 
     """
     found = point_cloud(loaded, settings, regions)
     found.write(path)
-    say(f"{len(found):,} points: {path}")
+    say(f"{counted(len(found), 'points')}: {path}")

@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.base.json_files import write_json
 from nerfloom.data.parsed_scene import ParsedScene
@@ -45,7 +46,7 @@ def export_cameras(loaded: Loaded, path: Path, settings: CameraSettings) -> None
     write_transforms(file, posed, settings.relative_paths)
     counts = ", ".join(f"{len(members)} {split}" for split, members in posed.splits.items())
     folder = shlex.quote(str(file.parent))
-    say(f"{len(posed.files)} cameras ({counts}): {file}; train on it: ns-train METHOD --data {folder}")
+    say(f"{counted(len(posed.files), 'cameras')} ({counts}): {file}; train on it: ns-train METHOD --data {folder}")
     model = path.parent / "colmap" / "sparse" / "0"
     try:
         write_model(model, posed)

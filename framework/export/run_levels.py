@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import ConfigError
 from nerfloom.cameras.camera_path import CameraPath
 from nerfloom.cameras.kept_cameras import read_cameras, write_cameras
@@ -101,7 +102,8 @@ def _write(
     found = read_levels(path)
     size = path.stat().st_size / 1e6
     say(
-        f"{size:.2f} MB, {found.num_gaussians:,} Gaussians in {len(found.nodes):,} chunks, {found.look.words()}: {path}"
+        f"{size:.2f} MB, {counted(found.num_gaussians, 'Gaussians')} in {counted(len(found.nodes), 'chunks')}, "
+        f"{found.look.words()}: {path}"
     )
 
 

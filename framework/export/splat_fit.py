@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import Any
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.base.device import seed_step
 from nerfloom.base.errors import ConfigError
 from nerfloom.base.machine_config import MachineConfig
@@ -131,5 +132,5 @@ def fit_gaussians(
     take_all(trainer.steps(), "Fitting Gaussians")
     found, dropped = fitted.gaussians(), trainer.state.skipped
     without = f" ({dropped:,} dropped: gradients not finite)" if dropped else ""
-    say(f"{len(found):,} Gaussians after {trainer.state.step:,} steps{without}")
+    say(f"{counted(len(found), 'Gaussians')} after {counted(trainer.state.step, 'steps')}{without}")
     return found

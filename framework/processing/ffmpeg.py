@@ -14,10 +14,19 @@ import numpy as np
 from nerfloom.base.console import say, track
 from nerfloom.base.errors import DataError
 from nerfloom.base.extras import install_command
+from nerfloom.base.lfs import ADVICE, is_pointer
 
 MAX_SIDE = 1000
 """Maximum side of the grey pictures used to judge frames, pixels."""
 _GREY = f"scale=min({MAX_SIDE}\\,iw):min({MAX_SIDE}\\,ih):force_original_aspect_ratio=decrease:flags=area,format=gray"
+
+HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+"""ffmpeg's name of a video's transfer function with a high dynamic range -> the usual name."""
+_TO_STANDARD_RANGE = (
+    "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=mobius:desat=0:peak=5,zscale=t=bt709,format=rgb24"
+)
+"""Filters for such a video. White is at 203 cd/m2 (ITU-R BT.2408), and the light up to five times as bright is
+compressed. The peak is fixed, so that all frames are mapped alike."""
 
 R = TypeVar("R")
 
@@ -39,7 +48,8 @@ def frame_count(path: Path) -> int:
     try:
         count, _ = imageio_ffmpeg.count_frames_and_secs(_named(path))
     except Exception as error:  # any type, from ffmpeg or its wrapper
-        raise DataError(f"--data {path} is not a readable video; play it to check that it is complete") from error
+        advice = ADVICE if is_pointer(path) else "play it to check that it is complete"
+        raise DataError(f"--data {path} is not a readable video; {advice}") from error
     return max(int(count), 1)
 
 
@@ -74,7 +84,8 @@ def survey(path: Path, look: Callable[[np.ndarray], R]) -> tuple[np.ndarray, lis
 
 def chosen_frames(path: Path, numbers: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the frames `numbers` (K,), ascending from 0, of the video `path` as (H, W, 3) uint8, upright."""
-    arguments = ["-i", _named(path), "-map", "0:v:0", *_passthrough(), "-c:v", "ppm", "-pix_fmt", "rgb24"]
+    filters = _to_standard_range(path)
+    arguments = ["-i", _named(path), "-map", "0:v:0", *filters, *_passthrough(), "-c:v", "ppm", "-pix_fmt", "rgb24"]
     wanted = iter(track(numbers.tolist(), "Reading the frames", total=len(numbers)))
     number = next(wanted, None)
     with closing(_pictures(path, [*arguments, "-f", "image2pipe", "pipe:1"])) as frames:
@@ -135,10 +146,35 @@ def _times(listed: Path) -> np.ndarray:
     return np.array(times)
 
 
+def _to_standard_range(path: Path) -> list[str]:
+    """Return ffmpeg's options that tone-map a video with a high dynamic range; none for others. This is reported.
+
+    Phones record such videos by default. Without tone-mapping their frames are grey.
+    """
+    shown = next((line for line in _said("-i", _named(path)).splitlines() if "Video:" in line), "")
+    kind = next((kind for name, kind in HDR.items() if name in shown), None)
+    if kind is None:
+        return []
+    filters = _said("-filters")
+    if " zscale " not in filters or " tonemap " not in filters:
+        say(
+            f"{path} is HDR video ({kind}), and this ffmpeg cannot tone-map it, so its frames are grey: convert it "
+            "first, or set IMAGEIO_FFMPEG_EXE to an ffmpeg with the filter zscale"
+        )
+        return []
+    say(f"{path} is HDR video ({kind}): its frames are tone-mapped to the standard range")
+    return ["-vf", _TO_STANDARD_RANGE]
+
+
 def _passthrough() -> list[str]:
     """Return ffmpeg's option to keep each frame once, at its time; before version 5.1 it is -vsync."""
+    return ["-fps_mode" if "fps_mode" in _said("-h", "long") else "-vsync", "passthrough"]
+
+
+def _said(*arguments: str) -> str:
+    """Return what ffmpeg prints."""
     import imageio_ffmpeg
 
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-h", "long"]
-    known = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False).stdout
-    return ["-fps_mode" if b"fps_mode" in known else "-vsync", "passthrough"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", *arguments]
+    done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False)
+    return (done.stdout + done.stderr).decode(errors="replace")

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TypeVar
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import DataError
 from nerfloom.base.evenly_spaced import evenly_spread
 from nerfloom.data.folders import walk
-from nerfloom.data.names_on_disk import COMPANIONS
+from nerfloom.data.names_on_disk import accompanies
 from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
 T = TypeVar("T")
@@ -40,7 +41,10 @@ def find_images(folder: Path, leave_out: Iterable[Path] = ()) -> list[Path]:
     images, companions = _without_companions(images)
     if companions:
         where = companions[0].parent.as_posix()
-        say(f"left out: {len(companions)} images in folders such as {where}, whose names say masks or the like")
+        say(
+            f"left out: {counted(len(companions), 'images')} in folders such as {where}, whose names say masks or the "
+            "like"
+        )
     if not images:
         raise DataError(f"--data {folder} has no images (looked for {', '.join(READABLE)}){_listed(others)}")
     if others:
@@ -82,7 +86,7 @@ def kind_of(kind: str, data: Path) -> tuple[str, Path]:
     images, others = _split(data, ())
     videos = [data / path for path in others if path.suffix.lower() in VIDEO_SUFFIXES]
     if images and kind == "video":
-        say(f"{data} is a folder of {len(images)} images: using them, as in ns-process-data images")
+        say(f"{data} is a folder of {counted(len(images), 'images')}: using them, as in ns-process-data images")
         return "images", data
     if not images and len(videos) > 1:
         raise DataError(f"--data {data} has {len(videos)} videos and no images; choose one: --data {videos[0]}")
@@ -113,15 +117,14 @@ def _split(folder: Path, leave_out: Iterable[Path]) -> tuple[list[Path], list[Pa
 
 
 def _without_companions(images: list[Path]) -> tuple[list[Path], list[Path]]:
-    """Return the photographs, and the images that accompany them, by the names of their folders (`COMPANIONS`).
+    """Return the photographs, and the images that accompany them, by the names of their folders.
 
     If all are in such folders, all are photographs.
     """
     photographs: list[Path] = []
     companions: list[Path] = []
     for path in images:
-        accompanies = any(part.lower().startswith(COMPANIONS) for part in path.parts[:-1])
-        (companions if accompanies else photographs).append(path)
+        (companions if accompanies(path.parts[:-1]) else photographs).append(path)
     return (photographs, companions) if photographs else (images, [])
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import DataError
 from nerfloom.base.json_files import write_json
 from nerfloom.processing import aria_lens
@@ -83,7 +84,7 @@ def write_capture(
     if capture.points is not None and capture.colors is not None:
         points = capture.points @ capture.frame[:, :3].T + capture.frame[:, 3]
         write_points(output / POINTS, points, capture.colors)
-        say(f"{len(points):,} points")
+        say(counted(len(points), "points"))
     masks = [frame.mask for frame in frames if frame.mask is not None]
     write_pyramid(output / "images", [frame.name for frame in frames], num_downscales)
     write_pyramid(output / "masks", masks, num_downscales if masks else 0, masks=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from nerfloom.base.counts import counted
 from nerfloom.processing.parallax import NO_PARALLAX, WITHOUT
 
 MIN_REGISTERED = 0.8
@@ -42,7 +43,7 @@ def lines(summary: Summary) -> list[str]:
     stages = ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in summary.seconds.items())
     messages = [
         f"registered: {summary.registered} of {summary.images} images ({share:.0%}); "
-        f"{summary.points} points; mean reprojection error {summary.reprojection_error:.2f} pixels",
+        f"{counted(summary.points, 'points')}; mean reprojection error {summary.reprojection_error:.2f} pixels",
         f"time: {sum(summary.seconds.values()):.1f} s ({stages})",
     ]
     if summary.other_models:

@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.processing import frame_choice
 from nerfloom.processing.ffmpeg import chosen_frames, survey
 from nerfloom.processing.images import save
@@ -44,7 +45,7 @@ def line(times: np.ndarray, fresh: int, target: int, written: int) -> str:
     """Return a line on frames at `times` (N,), seconds: `fresh` ones differ, and `written` of `target` were taken."""
     count, gaps = len(times), np.diff(times)
     uneven = " at uneven times" if count > 2 and gaps.max() > 1.5 * max(np.median(gaps), 1e-9) else ""
-    text = f"video: {count} frames in {times[-1] - times[0]:.1f} s{uneven}"
+    text = f"video: {counted(count, 'frames')} in {times[-1] - times[0]:.1f} s{uneven}"
     if fresh < count:
         text += f", {count - fresh} of them repeat the one before and are dropped"
     if written < target:

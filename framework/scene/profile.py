@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from nerfloom.base.counts import counted
 from nerfloom.base.decisions import Decision
 from nerfloom.data.dataset import Dataset
 from nerfloom.data.light_spread import light_spread
@@ -58,7 +59,8 @@ class SceneProfile:
         """Return the profile as lines of text."""
         alpha = "no alpha" if self.transparent is None else f"alpha ({self.transparent:.0%} of pixels transparent)"
         motion = "moving" if self.moving else "still"
-        facts = f"scene: {self.images} images of {self.width} x {self.height}, {self.camera} camera, {alpha}, {motion}"
+        images = f"{counted(self.images, 'images')} of {self.width} x {self.height}"
+        facts = f"scene: {images}, {self.camera} camera, {alpha}, {motion}"
         if self.scenes > 1:
             facts += f", {self.scenes} scenes"
         if self.ignored is not None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nerfloom.base.atomic import write_atomically
 from nerfloom.base.errors import ConfigError, DataError
+from nerfloom.base.lfs import ADVICE, is_pointer
 from nerfloom.splats.gaussian_limit import fitted, fitted_ply, fitted_spz
 from nerfloom.splats.gaussians import Gaussians, Splats
 from nerfloom.splats.gltf import encoded_glb
@@ -144,6 +145,8 @@ def _reader(file: Path) -> tuple[Format, Callable[[Path], Splats]]:
     found = next((each for each in FORMATS if each.starts and start.startswith(each.starts)), _named(file))
     if found is not None and found.read is not None and (not found.starts or start.startswith(found.starts)):
         return found, found.read
+    if is_pointer(file):
+        raise DataError(f"{file} cannot be read: {ADVICE}")
     program = "" if found is None else found.program
     what = f"of {program}'s format" if program else "no file of Gaussians, or its beginning is damaged"
     raise DataError(f"{file} is {what}; Gaussians are read from {_listed(READ, 'and')} files: convert it to PLY")

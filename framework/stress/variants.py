@@ -79,7 +79,7 @@ def chosen(dataset: Dataset, images: list[int]) -> Dataset:
     pixels = torch.cat([dataset.image(image).flatten(0, 1) for image in images])
     changed = with_photographs(dataset, pixels, dataset.cameras[index], kept_of(dataset, images, lambda mask: mask))
     times = None if dataset.times is None else dataset.times[index]
-    return replace(changed, times=times, paths=tuple(dataset.paths[image] for image in images))
+    return replace(changed, times=times, paths=tuple(dataset.paths[image] for image in images), given_names=None)
 
 
 def first_image(dataset: Dataset) -> Dataset:

@@ -6,6 +6,7 @@ import signal
 from collections.abc import Sequence
 
 from nerfloom.base.config import TrainConfig
+from nerfloom.base.counts import counted
 from nerfloom.training.state import State
 
 EVALUATION_SHARE, EVALUATION_SECONDS = 0.5, 10.0
@@ -36,7 +37,7 @@ def reason_to_stop(config: TrainConfig, state: State, stopped: Sequence[int]) ->
     if stopped:
         return "stopped by " + signal.Signals(stopped[0]).name
     if config.max_num_iterations is not None and state.step >= config.max_num_iterations:
-        return f"{config.max_num_iterations} steps done"
+        return f"{counted(config.max_num_iterations, 'steps')} done"
     if config.max_seconds is not None and state.seconds >= config.max_seconds:
         return f"{config.max_seconds:g} s of training spent"
     target, curve = config.target_psnr, state.curve

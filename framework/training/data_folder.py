@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerfloom.base.console import say
+from nerfloom.base.counts import counted
 from nerfloom.base.errors import ConfigError, DataError
 from nerfloom.data.folders import walk
 from nerfloom.data.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
@@ -125,7 +126,7 @@ def _advice(path: Path, formats: Mapping[str, type[DataParser]]) -> str:
         return f"the data is in a folder inside: --data {shlex.quote(str(data[0]))}{others}"
     files = list(islice((folder / name for folder, names in walk(path) for name in names), MAX_FILES))
     if count := sum(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
-        number = f"{count} image{'s' if count > 1 else ''}" if len(files) < MAX_FILES else "images"
+        number = counted(count, "images") if len(files) < MAX_FILES else "images"
         return f"there are {number}, but no camera poses. {_processing('images', path)}"
     if videos := sorted(file for file in files if file.suffix.lower() in VIDEO_SUFFIXES):
         return f"a video has no camera poses yet. {_processing('video', videos[0])}"

@@ -11,8 +11,10 @@ import pytest
 from PIL import Image
 
 import nerfloom
+from nerfloom.base.plain import converted
 from nerfloom.cli import evaluate, export, process_data, render
 from nerfloom.cli import train as train_command
+from nerfloom.cli.common import run_command
 from nerfloom.training.run import read_run
 from tests.cli.helpers import TINY_NGP, called, train
 from tests.conftest import Refused, ball_view
@@ -32,6 +34,17 @@ def test_every_command_has_a_version(monkeypatch: pytest.MonkeyPatch, capsys: py
         monkeypatch.setattr(sys, "argv", [command.name, "--version"])
         command.load()()
         assert capsys.readouterr().out.startswith(f"nerfloom {nerfloom.__version__} from ")
+
+
+def test_the_home_folder_may_stand_for_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shells replace ~ at the beginning of a word, and most do not in --data=~/scan."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    given: list[list[str]] = []
+    monkeypatch.setattr(sys, "argv", ["ns-train", "nerfacto", "--data=~/scan", "~/run", "--name=a~b", "--up", "-y"])
+    run_command(given.append)
+    assert given == [["nerfacto", f"--data={tmp_path}/scan", f"{tmp_path}/run", "--name=a~b", "--up", "-y"]]
+    assert converted("~/scan", Path, "data") == tmp_path / "scan"
 
 
 @pytest.mark.medium

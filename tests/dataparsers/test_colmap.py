@@ -371,17 +371,31 @@ def test_what_is_no_rotation_is_refused(folder: Path, numbers: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["{stem}.png", "{name}.png"])
-@pytest.mark.parametrize("place", ["masks", "masks_2"])
-def test_masks_are_found_by_the_images_name(tmp_path: Path, place: str, form: str) -> None:
+@pytest.mark.parametrize("place", ["masks", "masks_2", "mask", "mask_2"])
+def test_masks_are_found_by_the_images_name(
+    tmp_path: Path, place: str, form: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     capture = make_capture()
     capture.names = [f"cam1/p{index:02d}.jpg" for index in range(10)]
     write_colmap(tmp_path / "sparse", capture)
-    images, size = (tmp_path / "images", (60, 40)) if place == "masks" else (tmp_path / "images_2", (30, 20))
+    images, size = (tmp_path / "images", (60, 40)) if "_" not in place else (tmp_path / "images_2", (30, 20))
     write_images(images, capture.names, size)
     masks = [form.format(stem=name[:-4], name=name) for name in capture.names]
     write_images(tmp_path / place, masks[:-1], size)
     scene = Colmap(eval_interval=0).parse(tmp_path, "train")
     assert scene.mask_paths == (*(tmp_path / place / mask for mask in masks[:-1]), None)
+    assert ("used as the folder of masks" in capsys.readouterr().err) == (not place.startswith("masks"))
+
+
+def test_a_part_of_a_rig_is_named_as_the_whole_is(tmp_path: Path) -> None:
+    """Held-out images of one camera keep the folder that tells them from those of the other."""
+    capture = make_capture()
+    capture.names = [f"{side}/{index}.png" for side in ("left", "right") for index in range(5)]
+    write_colmap(tmp_path / "sparse", capture)
+    write_images(tmp_path / "images", capture.names)
+    scene = Colmap(eval_interval=10).parse(tmp_path, "test")
+    assert load_dataset(scene, "test").names == ("left/0.png",)
+    assert load_dataset(Colmap(eval_interval=10).parse(tmp_path, "train"), "train").names == tuple(capture.names[1:])
 
 
 def test_missing_images_are_counted_and_skipped(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -411,7 +425,7 @@ def test_cameras_of_several_models(folder: Path, capture: Capture) -> None:
     x, y = capture.seen(5).T
     assert misses(scene, 5, FX * x + CX, FY * y + CY, capture.points).max() < 1e-3
     cameras.write_text(text.replace("8 PINHOLE 60 40 50 48 31 19", "8 OPENCV_FISHEYE 60 40 50 48 31 19 0.1 0 0 0", 1))
-    with pytest.raises(DataError, match=r"'p00\.png' .*pinhole .*'p01\.png' .*fisheye"):
+    with pytest.raises(DataError, match=r"'p00\.png' .*pinhole.*'p01\.png' .*fisheye"):
         Colmap().parse(folder, "train")
 
 

@@ -456,7 +456,7 @@ BAD = {
     "focal length that float32 rounds to zero": (put(fl_y=1e-60), "pixels: out of range; correct them"),
     "centre beyond float32": (frame(cx=-1e200), r"004\.png: its camera has .* pixels: out of range"),
     "other shape": (put(w=30, h=40), r"000\.png is 40x30 pixels, but its camera is for 30x40"),
-    "unknown camera": (put(camera_model="OPENCVV"), "unknown camera_model 'OPENCVV'. Did you mean 'OPENCV'"),
+    "unknown camera": (put(camera_model="OPENCVV"), "unknown camera_model 'OPENCVV'; known: PERSPECTIVE, PINHOLE"),
     "camera is a list": (put(camera_model=[1]), "unknown camera_model"),
     "mixed cameras": (frame(camera_model="OPENCV_FISHEYE"), "mixes the camera models OPENCV_FISHEYE and PINHOLE"),
     "mask is a number": (frame(mask_path=3), "frame 4: 'mask_path' is missing"),

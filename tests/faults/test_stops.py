@@ -20,7 +20,7 @@ from tests.forked import Forks
 from tests.training.helpers import differences, tiny_run, tiny_trainer
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_run_after_the_step_at_hand_and_it_says_how_to_go_on(
     number: signal.Signals,
     shared_tiny: Path,

@@ -75,3 +75,17 @@ def test_a_video_and_a_folder_are_told_apart(tmp_path: Path) -> None:
 )
 def test_names_in_sequence(names: list[str], expected: bool) -> None:
     assert is_sequence([Path(name) for name in names]) == expected
+
+
+def test_what_servers_and_systems_add_is_no_photograph(tmp_path: Path) -> None:
+    touch(
+        tmp_path, "a/1.jpg", "a/@eaDir/1.jpg/SYNOFILE_THUMB_XL.jpg", "__MACOSX/a/1.jpg", "a/._1.jpg", "#recycle/2.jpg"
+    )
+    touch(tmp_path, "a/Thumbs.db")
+    assert [path.as_posix() for path in find_images(tmp_path)] == ["a/1.jpg"]
+
+
+def test_only_whole_names_of_folders_say_that_files_are_no_photographs(tmp_path: Path) -> None:
+    given = ["normal street/1.jpg", "Maskenball/1.jpg", "depths of the sea/1.jpg", "labelled/1.jpg"]
+    touch(tmp_path, *given, "masks_2/1.png", "Depth_Maps/1.png", "normals/1.png", "thumbnails/1.jpg", "mask/a/1.png")
+    assert sorted(path.as_posix() for path in find_images(tmp_path)) == sorted(given)

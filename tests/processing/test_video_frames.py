@@ -135,3 +135,28 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
     (tmp_path / "damaged.mp4").write_bytes(b"no video")
     with pytest.raises(DataError, match="not a readable video"):
         frame_count(tmp_path / "damaged.mp4")
+
+
+@pytest.mark.parametrize("transfer", ["arib-std-b67", "smpte2084"])
+def test_a_high_dynamic_range_is_mapped_to_the_standard_one(
+    tmp_path: Path, transfer: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The colours of a picture of standard range come back; as stored they are grey."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
+    colors = np.array([(255, 0, 0), (0, 255, 0), (0, 0, 255), (128, 128, 128)], np.uint8)
+    picture = np.repeat(np.repeat(colors[None], 64, 0), 32, 1)
+    to_hdr = f"zscale=pin=bt709:tin=bt709:min=gbr:rin=full:p=bt2020:t={transfer}:m=bt2020nc:r=tv:npl=203"
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "128x64", "-i", "-"]
+    tags = ["-color_primaries", "bt2020", "-color_trc", transfer, "-colorspace", "bt2020nc", "-color_range", "tv"]
+    coded = ["-vf", f"{to_hdr},format=yuv420p10le", "-c:v", "ffv1", *tags, str(tmp_path / "hdr.mkv")]
+    made = subprocess.run([ffmpeg, "-loglevel", "error", *raw, *coded], input=picture.tobytes(), check=False)
+    if made.returncode:
+        pytest.skip("this ffmpeg has no zscale")
+    (found,) = chosen_frames(tmp_path / "hdr.mkv", np.array([0]))
+    assert "tone-mapped" in capsys.readouterr().err
+    middles = found[32, 16::32].astype(int)
+    assert (middles[:3].argmax(-1) == np.arange(3)).all()
+    assert (middles[:3].max(-1) > 170).all()
+    assert (middles[:3].min(-1) < 70).all()
+    assert np.ptp(middles[3]) < 10
+    assert abs(middles[3] - 128).max() < 25

@@ -244,7 +244,7 @@ def test_learnt_weights_render_other_data(tmp_path: Path, shared_tiny: Path) -> 
         "pixel-nerf", shared_tiny, tmp_path / "one", load_checkpoint=trainer.save(), max_num_iterations=1
     )
     one.restore_as_configured()
-    assert one.train().reason == "1 steps done"
+    assert one.train().reason == "1 step done"
     for name, value in trainer.model.state_dict().items():
         assert torch.equal(one.model.state_dict()[name], value)
     shown = one.model.render_view(one.train_set.view(3), WHITE).rgb

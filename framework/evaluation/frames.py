@@ -7,6 +7,7 @@ replaced by encoded parts of it while others are rendered (`video/film.py`).
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import shutil
@@ -224,4 +225,6 @@ def _write(path: Path, write: Callable[[BinaryIO], object], flush: bool = True) 
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, write, flush)
     except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror or error}; use another path") from error
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        remedy = "free some space, and repeat the command" if full else "use another path"
+        raise ConfigError(f"cannot write {path}: {error.strerror or error}; {remedy}") from error

@@ -173,12 +173,12 @@ def _nearest_cameras(points: Tensor, centers: Tensor, count: int) -> tuple[Tenso
         centers: (M, 3) positions of the cameras.
         count: number of cameras per point.
     """
-    nearest, sums = [], torch.zeros(len(centers), dtype=torch.float64, device=points.device)
+    nearest, mean = [], torch.zeros_like(centers[:, 0])
     for some in points.split(max(PAIRS // len(centers), 1)):
         distance = torch.cdist(some, centers)
         nearest.append(distance.topk(min(count, len(centers)), largest=False).indices.int())
-        sums += distance.sum(0, dtype=torch.float64)
-    return torch.cat(nearest), sums / len(points)
+        mean += distance.mean(0) * (len(some) / len(points))
+    return torch.cat(nearest), mean
 
 
 def hull_points(hull: Tensor, box: Tensor, resolution: int, count: int) -> Tensor:

@@ -260,7 +260,7 @@ def test_a_full_disk_is_a_line_and_keeps_the_frames(
 
     monkeypatch.setattr(frames, "write_atomically", full)
     said = refused(render_command.main, "orbit", ball_run, "--output-path", tmp_path / "a.gif", "--num-frames", 4)
-    assert said.endswith("000002.npz: No space left on device")
+    assert said.endswith("000002.npz: No space left on device; free some space, and repeat the command")
     assert len(list((tmp_path / "a.gif.frames").glob("*/*.npz"))) == 2
 
 

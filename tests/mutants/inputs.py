@@ -58,7 +58,7 @@ MUTANTS = {
         Mutant("phone-mask-of-other-name", "companions_of", "found.get(spelled(name), A)", "A",
             "masks named as COLMAP names them are not found",
             "dataparsers/test_colmap.py::test_masks_are_found_by_the_images_name"),
-        Mutant("masks-for-images", "_moved", "(A for part in B[:-length])", "(A for part in B[:0])",
+        Mutant("masks-for-images", "_moved", "A and (not accompanies(B))", "A",
             "where images are missing, masks of their names are learnt from",
             "test_names_on_disk.py::test_nothing_is_taken_where_two_come_into_question"),
         Mutant("other-eye", "match_names", "A and (not files)", "A",

@@ -87,7 +87,7 @@ class Dataset:
     light_paths: tuple[Path | None, ...] | None = None
     """M files of true diffuse light, read when asked for; None if there are none."""
     given_names: tuple[str, ...] | None = None
-    """M names of the images in the whole data, of which these may be a part; None if `paths` are all."""
+    """M names of the images as the whole data has them; None if `paths` are all."""
     motion_bound: MotionBound | None = None
     """Distance that matter may move, on the CPU, estimated from the images; None if unknown or not needed."""
 

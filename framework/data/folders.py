@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 NOT_THE_USERS = {"@eadir", "@recycle", "#recycle", "$recycle.bin", "__macosx", "thumbs.db", "desktop.ini"}
-"""Names, in lower case, of what servers and systems put beside the user's files: thumbnails, deleted files, icons."""
+"""Lower-case names of folders and files that servers and systems add: thumbnails, deleted files, icons."""
 
 
 def walk(folder: Path) -> Iterator[tuple[Path, list[str]]]:

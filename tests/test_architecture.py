@@ -1,6 +1,7 @@
 """The house: imports run one way, files and functions stay small, everything public has a docstring."""
 
 import ast
+import dataclasses
 import functools
 import importlib
 import inspect
@@ -156,9 +157,11 @@ def test_every_setting_has_a_help_text() -> None:
 
 
 def _declared(file: Path, base: str) -> set[str]:
-    """Settings and class variables that a class, or one that it derives from, declares."""
+    """Settings, and class variables, that a class or one that it derives from declares."""
     kind = getattr(importlib.import_module(module_of(file)), base, object)
-    return {name for each in kind.__mro__ for name in inspect.get_annotations(each)}
+    settings = {f.name for f in dataclasses.fields(kind)} if dataclasses.is_dataclass(kind) else set()
+    notes = {name: note for each in kind.__mro__ for name, note in inspect.get_annotations(each).items()}
+    return settings | {name for name, note in notes.items() if str(note).startswith("ClassVar")}
 
 
 LAYERS = (

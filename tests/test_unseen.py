@@ -55,3 +55,16 @@ def test_opposite_cameras_still_give_rotations() -> None:
     poses = torch.stack([turned(0.0, (1, 0, 0)), turned(math.pi, (-1, 0, 0))])
     rotations = unseen_poses(poses, torch.zeros(50, dtype=torch.int64))[:, :, :3].double()
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(50, dtype=torch.float64), atol=1e-5, rtol=0)
+
+
+def test_a_neighbour_that_looks_elsewhere_does_not_count() -> None:
+    """Two cameras 70 degrees apart in direction, which rise as they turn, and one 50 degrees from the first."""
+    poses = []
+    for angle, place in ((0, (0.0, 0, 0)), (70, (1.0, 0, 0)), (50, (0, 1.0, 0))):
+        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        poses.append(torch.tensor([[1.0, 0, 0, place[0]], [0, c, -s, place[1]], [0, s, c, place[2]]]))
+    found = unseen_poses(torch.stack(poses), torch.zeros(200, dtype=torch.int64))
+    assert not bool(found[:, 0, 3].any())
+    assert float(found[:, 1, 3].max()) > 0.5
+    tilts = torch.rad2deg(torch.atan2(found[:, 2, 1], found[:, 1, 1]))
+    assert -7 < float(tilts.min()) < float(tilts.max()) < 57  # an eighth of the way beyond each

@@ -36,8 +36,7 @@ def run_and_close_terminal(folder: Path, ignored: bool) -> Path:
     ready, saved = folder / "ready", folder / "saved"
     child, terminal = pty.fork()
     if child == 0:
-        if ignored:
-            signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)  # these tests may run under nohup
         os.execv(sys.executable, [sys.executable, "-c", SCRIPT, str(ready), str(saved)])
     while not ready.exists():
         time.sleep(0.02)

@@ -3,6 +3,7 @@
 import dataclasses
 import shlex
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,15 @@ from tests.forked import Forks
 from tests.training.helpers import differences, tiny_run, tiny_trainer
 
 
+@pytest.fixture
+def a_terminal() -> Iterator[None]:
+    """SIGHUP counts, also if the tests run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("a_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_run_after_the_step_at_hand_and_it_says_how_to_go_on(
     number: signal.Signals,
@@ -72,6 +82,7 @@ def test_a_second_ctrl_c_says_what_was_saved(
 
 STOPPED = """
 import os, sys, threading
+from collections.abc import Iterator
 from pathlib import Path
 from tests.patience import until
 
